@@ -6,6 +6,7 @@ from itertools import pairwise
 from types import SimpleNamespace
 from unittest.mock import patch
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -1010,7 +1011,8 @@ def looked_at(algorithm, tmp_path, env="CartPole-v1", **fields):
         ("pqn", {}),
         ("sac", {}),
         ("sac", {"value_range": 10.0}),
-        ("sac", {"compile": "on"}),
+        ("sac", {"compile": "on", "num_updates": 4, "policy_delay": 2}),
+        ("ppo", {"env": "MountainCar-v0", "backend": "gymnasium"}),
         ("td3", {}),
         ("ddpg", {"compile": "on"}),
     ],
@@ -1034,6 +1036,47 @@ def test_a_gradient_is_of_the_terms_of_its_loss(algorithm, fields, tmp_path):
     if algorithm == "pqn":
         assert found["targets/unexplained"].max() < 1e-10
         assert found["targets/discount"] == pytest.approx(0.99, abs=1e-5)
+
+
+def test_of_frozen_networks_nothing_is_said_and_of_the_others_all(tmp_path):
+    found = looked_at("ppo", tmp_path, freeze=("policy",))
+    assert "gradient/policy" not in found
+    assert found["gradient/value_rest"].max() < 1e-9
+
+
+def test_of_one_observation_alone_the_weights_are_not_judged(tmp_path):
+    """A bandit: its advantages and its entropy turn the policy the same way."""
+
+    class Bandit(gym.Env):
+        observation_space, action_space = gym.spaces.Box(1, 1, (1,)), gym.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return np.ones(1, np.float32), {}
+
+        def step(self, action):
+            return np.ones(1, np.float32), float(action), True, False, {}
+
+    found = looked_at("a2c", tmp_path, env=Bandit, entropy_coef=0.5)
+    assert not {"gradient/policy", "gradient/entropy"} & found.keys()
+    assert found["gradient/policy_rest"].max() < 1e-9
+
+
+def test_a_learner_of_ones_own_may_leave_no_gradients_and_take_other_arguments(tmp_path, monkeypatch):
+    """Nothing is said then, and the run goes on."""
+    right = ppo.learn
+
+    def learn(config, state, batch, *others):
+        for parameter in state.networks.parameters():
+            parameter.grad = None
+        return right(config, state, batch, *others)
+
+    monkeypatch.setattr(ppo, "learn", learn)
+    assert looked_at("ppo", tmp_path)
+    state = SimpleNamespace(learn=lambda *args: args, optimizers=list)
+    watched = Watched(state, True)
+    assert state.learn(1, 2, 3) == (1, 2, 3)
+    assert watched.found == {}
 
 
 def entropy_punished(right):

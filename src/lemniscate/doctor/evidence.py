@@ -61,9 +61,9 @@ class Evidence:
         """The median of a metric in the last half of its lines; NaN, of which no rule speaks, if there is none."""
         return float(np.median(half)) if len(half := self.last_half(name)) else np.nan
 
-    def median(self, name: str) -> float:
-        """The median of a metric; NaN if fewer than three lines have it."""
-        return float(np.median(values)) if len(values := self.values(name)) >= 3 else np.nan
+    def median(self, name: str, least: int = 3) -> float:
+        """The median of a metric; NaN if fewer than `least` lines have it."""
+        return float(np.median(values)) if len(values := self.values(name)) >= least else np.nan
 
     def last(self, name: str) -> float:
         """The last value of a metric; NaN if there is none."""

@@ -89,7 +89,7 @@ CONSEQUENCES = {
     "action-late": {"exploding-observation"},
     "reward-unexplained": {"exploding-observation"},
     "advantage-not-normalized": {"ratio-not-one", "loss-differs"},
-    "advantage-opposed": {"ratio-not-one", "targets-behind", "policy-still", "loss-differs"},
+    "advantage-opposed": {"ratio-not-one", "targets-behind", "policy-still", "rows-of-others"},
     "targets-alike": {"critic-still"},
     "gradient-grows": {"value-runaway"},
     "policy-still": {"units-inactive"},
@@ -121,7 +121,8 @@ RULES = [Rule(name, kind, **row) for kind, rows in TABLE.items() for name, row i
 def findings(e: Evidence) -> list[tuple[Rule, str]]:
     """The rules that apply, each with what was seen, in their order."""
     with np.errstate(all="ignore"):  # a run that has broken logs ∞ and NaN
-        seen = dict(fault for of_subject in SUBJECTS for fault in of_subject(e))
+        every = [fault for of_subject in SUBJECTS for fault in of_subject(e)]
+    seen = dict(reversed(every))  # of two sentences the first counts
     return without_consequences([(rule, seen[rule.name]) for rule in RULES if rule.name in seen])
 
 
@@ -467,7 +468,7 @@ def of_entropies(e: Evidence) -> Seen:
     entropy, temperature = e.values("losses/entropy"), e.values("temperature")
     weight, target = e.config.get("entropy_coef"), first_number(e.config.get("target_entropy"))
     far = e.beyond("entropy_coef", *e.usual.get("entropy_coef", (0.0, np.inf))) > FAR and ">" not in str(weight)
-    if far and len(entropy) >= 4 and not len(e.values("gradient/entropy")):  # which knows
+    if far and len(entropy) >= 4 and len(e.values("gradient/entropy")) < 2:  # which knows
         lost = entropy[0] - np.median(entropy[len(entropy) // 2 :])
         if lost > max(0.2, 0.3 * abs(entropy[0])):
             yield (
@@ -517,8 +518,9 @@ def of_advantages(e: Evidence) -> Seen:
             f"Where episodes terminate, the value still awaits {awaited:.0%} of what it awaits elsewhere.",
         )
     # Once hardly any entropy is left, the correlation is chance, and only its sign still tells.
-    falls = errors < -3 or (errors < -2 and followed.mean() < -0.04)
-    if falls or (len(followed) >= 4 and followed.mean() < -0.06 and np.mean(followed < 0) > 0.8):
+    known = e.median("gradient/policy_rest", 2) > ROUNDING  # the loss itself is another one
+    falls = not known and (errors < -3 or (errors < -2 and followed.mean() < -0.04))
+    if falls or (not known and len(followed) >= 4 and followed.mean() < -0.06 and np.mean(followed < 0) > 0.8):
         yield (
             "advantage-opposed",
             f"The probabilities of actions fall with their advantage: the correlation is {followed.mean():.2f}.",
@@ -576,9 +578,11 @@ def of_batches(e: Evidence) -> Seen:
             "discount-differs",
             f"From row to row targets are discounted by {discount:.4g}, not by {gamma:g}.",
         )
-    if abs(missing) > 0.01:
-        said = f"targets lack {missing:.0%} of the value that follows"
-        yield "missing-bootstrap", f"Where a time limit or a rollout's end cuts an episode, {said}."
+    cut = "Where a time limit or a rollout's end cuts an episode, targets"
+    if missing > 0.01:
+        yield "missing-bootstrap", f"{cut} lack {missing:.0%} of the value that follows."
+    elif missing < -0.01:
+        yield "targets-differ", f"{cut} have {1 - missing:.2g} times the value that follows."
     if beyond > 0.01:
         yield "ends-continued", f"{beyond:.0%} of the squares of the targets at terminations are not the reward's."
 
@@ -603,51 +607,51 @@ def _has_targets(e: Evidence) -> bool:
 
 
 MISTAKES = {
-    "not_zeroed": ("gradient-grows", "has the one before in it: it is never set to zero"),
+    "not_zeroed": ("gradient-grows", "still has the one of the step before in it: it was not set to zero"),
     "mean_target": ("loss-of-others", "is that of one target for all rows, their mean"),
     "ends_ignored": ("ends-continued", "of Q is that of targets with a value behind terminations"),
     "online_target": ("targets-copied", "of Q is that of targets of Q itself, without target networks"),
     "followed_target": ("loss-differs", "of Q goes through its own targets: these need a detach()"),
     "other_action": ("rows-of-others", "is that of Q(s, ·) at other actions than were taken"),
-    "other_rows": ("rows-of-others", "is that of an action, a target or a next observation of another row"),
+    "other_rows": ("rows-of-others", "is that of an action, a reward, a target or a next observation of another row"),
 }
-"""mistakes that `run/updates.py` tries where a gradient is of no term; each with its rule and what is seen"""
+"""mistakes that `run/updates.py` tries where no term explains a gradient; each with its rule and what is seen"""
 
 
 def of_first_steps(e: Evidence) -> Seen:
     """Faults of what the first gradient step of an update is given, and of its targets: exact, as `of_gradients`."""
-    if len(other := e.values("gradient/other_rows")) >= 2 and other.min() > 0.01:
-        yield "rows-of-others", f"{np.median(other):.0%} of the rows of a gradient step are not as they were collected."
-    if (apart := e.median("gradient/old_policy")) > 1e-4:
-        yield "ratio-not-one", f"Before the first gradient step log π is already {apart:.2g} away from log π_old."
+    if (other := e.median("gradient/other_rows", 2)) > 0.01:
+        yield "rows-of-others", f"{other:.0%} of the rows of a gradient step are not as they were collected."
+    if (apart := e.median("gradient/old_policy", 2)) > 1e-3:
+        what = "KL(π_old ‖ π)" if "min_temperature" in e.config else "|log π − log π_old|"
+        yield "ratio-not-one", f"Before the first gradient step of an update {what} is already {apart:.2g}."
     for mistake, (name, what) in MISTAKES.items():
-        if e.late(f"gradient/if_{mistake}") < ROUNDING:
+        if e.median(f"gradient/if_{mistake}", 2) < ROUNDING:
             yield name, f"To rounding, the gradient {what}."
 
 
 def of_gradients(e: Evidence) -> Seen:
-    """Whether gradients are of the terms of the equations' loss: a healthy run's are to rounding."""
+    """Whether the terms of the equations' loss explain the gradients: a healthy run's to rounding."""
+    rests = {part: e.median(f"gradient/{part}_rest", 2) for part in ("policy", "value")}
+    weights = {part: e.median(f"gradient/{part}", 2) for part in rests}
     for part, whose in (("policy", "the policy"), ("value", "V or Q")):
-        weight, share = _weight_and_rest(e, part)
-        right = (first_number(e.config.get("value_coef")) if part == "value" else None) or 1.0
-        if share > ROUNDING:
-            of = f"{100 * share:.2g} % of the squares of the gradient of {whose}"
-            yield "loss-differs", f"{of} are of no term of its loss."
-        elif weight < 0:
+        if rests[part] > ROUNDING:
+            share = f"{100 * rests[part]:.2g} % of the squares of the gradient of {whose}"
+            yield "loss-differs", f"No term of the loss explains {share}."
+        elif weights[part] < 0:
             name = "advantage-opposed" if part == "policy" else "loss-differs"
-            yield name, f"The loss of {whose} is climbed: its weight in the gradient is {weight:.2g}."
-        elif weight > FAR * right or weight < right / FAR:
-            yield "loss-differs", f"The loss of {whose} has the weight {weight:.2g} in its gradient, not {right:g}."
-    entropy = e.values("gradient/entropy")
-    if len(entropy) >= 2 and entropy.max() < 1e-5 and np.median(entropy) < -1e-4:
+            yield name, f"Training raises the loss of {whose} in place of lowering it."
+            return
+    entropy, coef = e.values("gradient/entropy"), first_number(e.config.get("value_coef"))
+    if coef and not FAR > weights["value"] / weights["policy"] / coef > 1 / FAR and weights["policy"] > 0:
+        times = weights["value"] / weights["policy"]
+        yield (
+            "loss-differs",
+            f"The loss of V weighs {times:.2g} times that of the policy, and is to weigh {coef:g} times.",
+        )
+    surer = len(entropy) >= 2 and entropy.max() < 1e-5 and np.median(entropy) < -1e-4
+    if surer and not rests["policy"] > ROUNDING:
         yield "entropy-opposed", f"The gradient lowers the entropy: that is {-np.median(entropy):.1%} of its length."
-
-
-def _weight_and_rest(e: Evidence, part: str) -> tuple[float, float]:
-    """The weight of a term in its gradient, and the share of no term; NaN where fewer than two were looked at."""
-    both = e.values(f"gradient/{part}"), e.values(f"gradient/{part}_rest")
-    weight, rest = (float(np.median(each)) if len(each) >= 2 else np.nan for each in both)
-    return weight, rest
 
 
 def of_losses(e: Evidence) -> Seen:
@@ -680,7 +684,7 @@ def of_values(e: Evidence) -> Seen:
     own, of_gae = map(e.last_half, ("explained_variance", "value/explained"))
     constant = len(own) and np.median(own) < -1
     shares = of_gae if len(of_gae) and (constant or not len(own) or np.median(of_gae) < np.median(own)) else own
-    explained = float(np.median(shares)) if len(shares) else np.nan
+    explained = float(np.median(shares)) if len(shares) >= 3 else np.nan
     losses, fits = e.values("losses/value"), e.late("losses/value")
     grew = np.median(losses[len(losses) // 4 :]) / max(losses[0], 0.05) if len(losses) >= 4 else np.nan
     if _lacks_bootstrap(e):
@@ -696,7 +700,8 @@ def of_values(e: Evidence) -> Seen:
     one_reward = (nothing or steady) and not e.is_settled and len(missing) >= 2 and missing.min() > 5
     few = (one_reward or (away > 40 and explained < 0.3)) if "gae_lambda" in e.config else away > 40 and fits < 1e-3
     few = few or ("td_lambda" in e.config and away > 7 and missing.min() > 0)
-    if grew > (7 if e.config.get("scale_rewards") else 50) and not e.rose:
+    added = e.median("gradient/if_not_zeroed", 2) < ROUNDING  # its cause is known
+    if not added and grew > (7 if e.config.get("scale_rewards") else 50) and not e.rose:
         yield "value-runaway", f"The loss of V grew to {grew:,.0f} times what it was, though returns did not rise."
     elif few and e.is_paid and not e.early("value/moved") < 1e-3:  # else it has only not learned
         yield (
@@ -897,8 +902,9 @@ def of_evaluations(e: Evidence) -> Seen:
             "evaluated-otherwise",
             f"Training ends at {last.mean():,.4g}, and the deterministic policy has {mean:,.4g} in the evaluation.",
         )
-    longest, evaluated = np.max(e.lengths[-max(20, len(e.lengths) // 5) :], initial=0), e.late("evaluation/length")
-    if evaluated > 1.5 * longest > 0:
+    latest, evaluated = e.lengths[-max(20, len(e.lengths) // 5) :], e.late("evaluation/length")
+    longest = np.max(latest, initial=0)
+    if evaluated > 1.5 * longest > 0 and np.mean(latest == longest) > 0.5:  # another time limit
         yield (
             "evaluated-otherwise",
             f"Episodes last {longest:,.0f} steps at most in training, and {evaluated:,.0f} on average in evaluations.",
@@ -918,6 +924,10 @@ def of_evaluations(e: Evidence) -> Seen:
 
 
 SUBJECTS = (
+    of_first_steps,  # first what is exact
+    of_gradients,
+    of_batches,
+    of_used_advantages,
     of_observations,
     of_normalization,
     of_actions,
@@ -932,10 +942,6 @@ SUBJECTS = (
     of_exploration,
     of_entropies,
     of_advantages,
-    of_batches,
-    of_used_advantages,
-    of_gradients,
-    of_first_steps,
     of_losses,
     of_values,
     of_q,

@@ -132,7 +132,7 @@ class Learner:
         """`learn` once, without the compiler, while its optimizers move nothing."""
         try:
             for optimizer in self._optimizers:
-                vars(optimizer)["descend"] = torch.norm
+                vars(optimizer)["descend"] = torch.norm  # it returns ‖g‖, and moves nothing
             self._learn(*args, **flags)
         finally:
             for optimizer in self._optimizers:

@@ -25,6 +25,8 @@ from lemniscate.types import Rollout, Transition
 
 LOOKS = 24
 """how often in a run the signals are measured"""
+FIRST_CLOSE, EVERY_CLOSE = 4, 6
+"""the looks in which gradients are taken apart: the first, before a policy collapses, and one of so many later"""
 KINDS = (
     *("reward/", "observation/", "action/", "value/", "advantage/"),
     *("network/", "normalizer/", "td_error/", "replay/", "targets/", "gradient/"),
@@ -44,6 +46,11 @@ MOST_NUMBERS = 32
 """numbers of an observation up to which lines are fitted to them; for more there are too few rows"""
 UNITS = (*ACTIVATIONS.values(), nn.Tanh, nn.GELU, nn.LeakyReLU)
 """the modules whose outputs are hidden units; the last three are those of networks of one's own"""
+
+
+def is_close(look: int) -> bool:
+    """Whether the update of that look is looked at closely."""
+    return look < FIRST_CLOSE or look % EVERY_CLOSE == 0
 
 
 @torch.no_grad()

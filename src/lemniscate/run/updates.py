@@ -1,4 +1,4 @@
-"""What the update of a run that is looked at was made of, beside the equations: its rows, its targets, its gradients.
+"""Compares an update of a run with the equations: the rows that it took, its targets, and its gradients.
 
 `Watched` stands in the place of an algorithm's `learn` meanwhile. A healthy update fulfils the equations to rounding;
 one with a mistake in a loss, in the targets or in the order of rows does not, whatever the environment.
@@ -19,6 +19,7 @@ from lemniscate.data.rollout import QBatch, SoftBatch
 from lemniscate.maths import clipped_surrogate, explained_variance, gae, policy_gradient, td_target, value_loss
 from lemniscate.nn.actor_critic import ActorCritic, Value, of_next
 from lemniscate.nn.critics import CategoricalQ, Critics
+from lemniscate.nn.networks import Bfloat16Linear
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, LossFunction
 from lemniscate.optim.compiled import Learner
@@ -28,7 +29,11 @@ from lemniscate.types import Batch, DrawnBatch, Metrics, Rollout, Transition, wi
 Given = tuple[Any, tuple[Tensor, ...], bool]
 """what the gradient steps of an update were given: see `Watched.given`"""
 ROUNDING = 1e-6
-"""the share of the squares of a gradient from which on it is not of rounding; a healthy one has 1e-12"""
+"""the share of a gradient's squares above which what no term explains cannot be rounding; healthy runs have 1e-12"""
+MOST_CALLS = 8
+"""calls of `learn` in which the first gradient of each optimizer is waited for; some are stepped elsewhere"""
+MOST_PARAMETERS = 5_000_000
+"""beyond which gradients are not taken apart, of which each term has a copy in float64"""
 PARTS = "policy.", "value."
 """how the names of the parameters of a policy and of V(s) begin"""
 
@@ -58,7 +63,7 @@ class Watched:
         self._calls += 1
         if not self._given and len(args) > 2:
             self._given = self._with_values(args[2]), *args[3:]
-        if not self._unseen:
+        if not self._unseen or self._calls > MOST_CALLS:
             return self._learn(*args, **flags)
         self._now, watched = args, [*self._unseen]
         for optimizer in watched:
@@ -73,33 +78,43 @@ class Watched:
         return self._learn(*args, **flags)
 
     def _with_values(self, data: Any) -> Any:
-        """The data of an update; of Q, with the largest Q(s, ·) of the networks before it as the value."""
+        """The data [B, …]; of Q, with max_a Q(s, a) [B] of the networks before this update as `value`."""
         if type(data) is not QBatch:
             return data
-        return replace(data, value=self._state.networks.value(data.obs).detach()) if self._closely else None
+        with suppress(Exception), torch.no_grad():  # networks of one's own may have no such thing
+            return replace(data, value=self._state.networks.value(data.obs)) if self._closely else None
 
     def _rehearse(self, learner: Learner, config: Any, state: Any, data: Any, *by_step: Tensor, **flags: Any) -> None:
-        """The first gradient step without the compiler, whose programs nobody can look into; it moves nothing."""
-        first = {name: flag[:1] if isinstance(flag, tuple) else flag for name, flag in flags.items()}
-        modules = state.networks, getattr(state, "targets", None)
-        tensors = [each for module in modules if module for each in (*module.parameters(), *module.buffers())]
+        """A gradient step without the compiler, whose programs nobody can look into; it moves nothing."""
+        several = [flag for flag in flags.values() if isinstance(flag, tuple)]
+        k = next((k for k in range(len(by_step[0])) if all(flag[k] for flag in several)), 0)  # in which all move
+        one = {name: flag[k : k + 1] if isinstance(flag, tuple) else flag for name, flag in flags.items()}
+        self._now = config, state, data, *(tensor[k : k + 1] for tensor in by_step)
+        modules = [each for each in vars(state).values() if isinstance(each, nn.Module)]
+        tensors = [each for module in modules for each in (*module.parameters(), *module.buffers())]
         before = [each.detach().clone() for each in tensors]
-        learner.rehearse(config, state, data, *(tensor[:1] for tensor in by_step), **first)
-        for tensor, was in zip(tensors, before, strict=True):
-            tensor.data.copy_(was)
+        try:
+            with suppress(Exception):  # what is wrong with it, the step itself says
+                learner.rehearse(*self._now, **one)
+        finally:
+            for tensor, was in zip(tensors, before, strict=True):
+                tensor.data.copy_(was)
 
     def _gradient(self, optimizer: Adam, loss: LossFunction, *args: Any) -> tuple[Tensor, Metrics]:
         """The gradient of an optimizer, which is looked at once."""
-        is_first = not self.found
+        is_first = len(self._unseen) == len(self._state.optimizers())
         del vars(optimizer)["gradient"]
         self._unseen.remove(optimizer)
-        before = torch.cat([each.grad.flatten() for each in optimizer.parameters if each.grad is not None])
+        grads = [each.grad for each in optimizer.parameters]
+        before = torch.cat([grad.flatten() for grad in grads if grad is not None] or [torch.zeros(0)])
         gradient, metrics = optimizer.gradient(loss, *args)
-        with suppress(Exception):  # a loss of one's own may be given anything; then nothing is said of it
-            if is_first and isinstance(rows := self._now[3], Tensor):
-                self.found |= of_minibatch(self._now[2], rows[0], args[0])
-            with torch.no_grad():
-                self.found |= of_old_policy(optimizer.networks, args[0])
+        # A loss of one's own may be given anything: then nothing is said of it.
+        with suppress(Exception), torch.no_grad():
+            if is_first:
+                self.found |= of_minibatch(self._now[2], self._now[3][0], args[0])
+        with suppress(Exception), torch.no_grad():
+            self.found |= of_old_policy(optimizer.networks, args[0])
+        with suppress(Exception):
             of_it = self._now[0], self._state, optimizer, gradient
             self.found |= (found := of_gradient(*of_it, args))
             if any(name.endswith("_rest") and share > ROUNDING for name, share in found.items()):
@@ -127,8 +142,7 @@ def spread(x: Tensor) -> Tensor:
 def of_update(state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
     """Of the newest update, from rows [T, N, …] and the networks before it, for algorithms with a V(s).
 
-    - network/moved and value/moved: the length of the way of the policy's parameters and of V's, as a share of the
-      length of these.
+    - network/moved and value/moved: how far the parameters of the policy and of V moved, as a share of their length.
     - advantage/followed: the correlation of A(s, a) and of the change of log π(a|s).
     - value/explained: the explained variance of the targets of V, of γ and λ = 0.95, by V before the update.
     """
@@ -184,8 +198,9 @@ def of_batch(config: RunConfig, given: Given, rows: Rollout) -> dict[str, Tensor
         return found
     steps = min(len(columns[0]), len(rows.done))
     (v, g, *a), newest = (x[-steps:] for x in columns), rows[-steps:]
-    other = (data.action.view(-1, *newest.action.shape[1:])[-steps:] != newest.action).reshape(*g.shape, -1).any(-1)
-    found["targets/other_actions"] = other[newest.valid].float().mean()
+    if data.action.dtype == newest.action.dtype and data.action.shape[1:] == newest.action.shape[2:]:
+        other = data.action.reshape(-1, *newest.action.shape[1:])[-steps:] != newest.action
+        found["targets/other_actions"] = other.reshape(*g.shape, -1).any(-1)[newest.valid].float().mean()
     beyond, size = g - newest.reward.to(g.dtype), g.square().mean()
     lam = getattr(config, "gae_lambda", getattr(config, "td_lambda", 1.0))
     on, ends = ~newest.done[:-1] & newest.valid[:-1] & newest.valid[1:], newest.terminated & newest.valid
@@ -224,7 +239,7 @@ def of_cuts(
     cut &= newest.valid & ~newest.terminated
     own = {key.removeprefix(PARTS[1]): x for key, x in acted.items() if key.startswith(PARTS[1])}
     ahead = getattr(config, "gamma", 1.0) * _of_old(value, own, newest.next_obs[cut]).to(beyond.dtype)
-    if not ahead.any():
+    if ahead.square().sum() <= 1e-6 * columns[1][-steps:][cut].square().sum():  # else it is of rounding
         return {}
     return {"targets/missing": 1 - (beyond[cut] * ahead).sum() / ahead.square().sum()}
 
@@ -246,23 +261,20 @@ def _columns_of(config: RunConfig, data: Any, rows: Rollout) -> list[Tensor]:
 
 
 def of_minibatch(data: Any, rows: Tensor, batch: Any) -> dict[str, Tensor]:
-    """The share of the rows of a gradient step, [M, …], that are not those of the data that it was to take.
+    """The share of the rows of a gradient step, [M, …], that are not those of the data [B, …] that it was to take.
 
-    Advantages are left out, which are standardized on the way.
+    Advantages are left out, which are standardized on the way, and images and rewards, which may be changed on purpose.
     """
     if type(data) is not type(batch):
         return {}
     right, size = data[rows], rows.shape
-    others = [
-        (getattr(batch, name) != column).reshape(*size, -1).any(-1)
-        for name, column in vars(right).items()
-        if name != "advantage"
-    ]
+    names = {"action", "target", "log_prob", *(["obs"] if batch.obs.is_floating_point() else [])} & vars(batch).keys()
+    others = [(getattr(batch, name) != getattr(right, name)).reshape(*size, -1).any(-1) for name in names]
     return {"gradient/other_rows": torch.stack(others).any(0).float().mean()}
 
 
 def of_old_policy(networks: Any, batch: Any) -> dict[str, Tensor]:
-    """How far the policy is from the one that acted, before its first gradient step: the mean of |log π − log π_old|.
+    """The mean of |log π − log π_old| in a minibatch [M, …] before the first gradient step, where both are one policy.
 
     Of REPPO it is the KL divergence, of which the policy's μ and log σ are stored.
     """
@@ -285,29 +297,39 @@ def of_gradient(
     - gradient/policy_rest, gradient/value_rest: the share of the squares that is of no term, among the parameters that
       the terms move.
     """
+    parameters, found = optimizer.parameters, dict[str, Tensor]()
+    if len(gradient) > MOST_PARAMETERS or any(isinstance(m, Bfloat16Linear) for m in optimizer.networks.modules()):
+        return found  # whose rounding is no share of 1e-12
     with torch.enable_grad():
         terms = terms_of(config, state, optimizer.networks, *args)
-        parameters, found = optimizer.parameters, dict[str, Tensor]()
         slopes = {
             name: torch.autograd.grad(term, parameters, retain_graph=True, allow_unused=True, materialize_grads=True)
             for name, term in terms.items()
+            if term.requires_grad  # not of frozen networks
         }
     columns = {name: torch.cat([each.flatten() for each in slope]).cpu().double() for name, slope in slopes.items()}
-    for part in (("policy", "entropy", "kl"), ("value",)):
+    for part in (("policy", "entropy", "kl", "baseline"), ("value",)):
         own = {name: columns[name] for name in part if name in columns and columns[name].any()}
-        if {"policy", "entropy"} <= own.keys() and _are_parallel(own["policy"], own["entropy"]):
-            del own["entropy"]
         moved = torch.stack([*own.values()]).any(0) if own else torch.zeros(len(gradient), dtype=torch.bool)
         whole = gradient.cpu().double()[moved]
         if whole.any():
             its = torch.stack([column[moved] for column in own.values()], 1)
             weights = torch.linalg.lstsq(its, whole[:, None], driver="gelsd").solution[:, 0]
             found[f"gradient/{part[0]}_rest"] = (whole - its @ weights).square().sum() / whole.square().sum()
-            known = dict(zip(own, weights, strict=True))
-            found |= {f"gradient/{part[0]}": known[part[0]]} if part[0] in own else {}
-            if "entropy" in own:
+            known = {name: weights[k] for k, name in enumerate(own) if _stands_alone(its, k, whole)}
+            found |= {f"gradient/{part[0]}": known[part[0]]} if part[0] in known else {}
+            if "entropy" in known:
                 found["gradient/entropy"] = known["entropy"] * own["entropy"].norm() / whole.norm()
     return found
+
+
+def _stands_alone(columns: Tensor, k: int, whole: Tensor) -> bool:
+    """Whether the weight of column k of [P, K] is determined: it is not too small, and no other column is parallel.
+
+    Those of a policy that has seen one observation alone are: its advantages and its entropy turn it the same way.
+    """
+    alike = torch.cosine_similarity(columns, columns[:, k : k + 1], 0).abs()
+    return bool(columns[:, k].norm() > 1e-5 * whole.norm() and (alike > 0.999).sum() == 1)
 
 
 class Online(NamedTuple):
@@ -321,24 +343,29 @@ class Online(NamedTuple):
 def of_mistakes(
     config: RunConfig, state: Any, optimizer: Adam, gradient: Tensor, before: Tensor, args: tuple[Any, ...]
 ) -> dict[str, Tensor]:
-    """The most of a gradient that is of no term if a well-known mistake was made: shares of squares, "gradient/if_…".
+    """The share of a gradient's squares that no term explains if a well-known mistake was made: "gradient/if_…".
 
     - ends_ignored: Q awaits something behind terminations, too.
     - mean_target: each value has the mean of all targets, as where [B, 1] less [B] is [B, B].
     - other_rows: an action, a target, a reward or a next observation is of the row beside, or of the reverse order.
     - other_action: Q(s, ·) of another action is moved.
     - online_target, followed_target: y is of Q itself; and the gradient goes through it.
-    - not_zeroed: the gradient is added to the one `before`.
+    - not_zeroed: the gradient [P] is added to the one `before`, [P].
     """
     batch, *noise = args
-    left = {"not_zeroed": [of_gradient(config, state, optimizer, gradient - before, args)]}
+    parts = of_gradient(config, state, optimizer, gradient, args)
+    left: dict[str, list[dict[str, Tensor]]] = {}
+    if len(before) == len(gradient) and before.any():
+        left["not_zeroed"] = [of_gradient(config, state, optimizer, gradient - before, args)]
     for name, its_state, rows in _mistaken(state, batch):
         left.setdefault(name, []).append(of_gradient(config, its_state, optimizer, gradient, (rows, *noise)))
-    none, found = torch.ones(()), dict[str, Tensor]()
-    for name, variants in left.items():
-        rests = [[each.get(f"gradient/{part}_rest", none * 0) for part in ("policy", "value")] for each in variants]
-        found[f"gradient/if_{name}"] = torch.stack([torch.stack(pair).max() for pair in rests]).min()
-    return found
+    rests, one = [name for name in parts if name.endswith("_rest")], torch.ones((), dtype=torch.float64)
+    return {
+        f"gradient/if_{name}": torch.stack(
+            [torch.stack([each.get(rest, one) for rest in rests]).max() for each in variants]
+        ).min()
+        for name, variants in left.items()
+    }
 
 
 def _mistaken(state: Any, batch: Any) -> Iterator[tuple[str, Any, Any]]:
@@ -362,15 +389,11 @@ def _mistaken(state: Any, batch: Any) -> Iterator[tuple[str, Any, Any]]:
             yield "other_rows", state, replace(batch, **{column: moved})
 
 
-def _are_parallel(one: Tensor, other: Tensor) -> bool:
-    """Whether two vectors cannot be told apart, as the terms of a policy that has seen one observation alone."""
-    return bool(torch.cosine_similarity(one, other, 0).abs() > 0.999)
-
-
 def terms_of(config: Any, state: Any, networks: Any, batch: Any, *noise: Tensor) -> dict[str, Tensor]:
-    """The terms of the equations' loss for these networks and rows, each a scalar to descend; none where it is unknown.
+    """The terms of the equations' loss for networks and rows [M, …], scalars to descend; none where it is unknown.
 
-    "policy" judges actions, "value" V or Q, "entropy" is that of the policy with a minus, "kl" what holds it back.
+    "policy" judges actions, "value" V or Q, "entropy" is that of the policy with a minus, "kl" what holds it back, and
+    "baseline" what a mean of the advantages does. Not known are TRPO's surrogate, temperatures and multipliers.
     """
     if isinstance(batch, Batch):
         return _of_advantages(config, networks, batch)
@@ -381,6 +404,8 @@ def terms_of(config: Any, state: Any, networks: Any, batch: Any, *noise: Tensor)
         near, q = kl < config.max_kl, state.networks.critic(batch.obs, action)
         parts = {"policy": -q * near, "entropy": alpha * log_prob * near, "kl": kl * ~near}
         return {name: part.mean() for name, part in parts.items()}
+    if isinstance(batch, QBatch) and isinstance(networks, Value):  # SHAC
+        return {"value": value_loss(networks(batch.obs), batch.target)}
     if isinstance(batch, QBatch):
         soft = isinstance(networks, CategoricalQ)
         pair = batch.action, batch.target
@@ -401,7 +426,7 @@ def terms_of(config: Any, state: Any, networks: Any, batch: Any, *noise: Tensor)
 
 
 def _of_advantages(config: Any, networks: Any, batch: Batch) -> dict[str, Tensor]:
-    """The terms of a policy that follows advantages, and of the V(s) beside it, where there are both."""
+    """The terms of a policy that follows the advantages of rows [M, …], and of the V(s) beside it, if there is one."""
     of_both = networks(batch.obs)
     distribution, value = of_both if isinstance(networks, ActorCritic) else (of_both, of_both)
     terms = dict[str, Tensor]()
@@ -412,7 +437,7 @@ def _of_advantages(config: Any, networks: Any, batch: Batch) -> dict[str, Tensor
             terms["policy"] = clipped_surrogate(log_prob - batch.log_prob, advantage, clip)
         else:
             terms["policy"] = policy_gradient(log_prob, advantage)
-        terms["entropy"] = -distribution.entropy().mean()
+        terms |= {"entropy": -distribution.entropy().mean(), "baseline": -log_prob.mean()}
     if not isinstance(networks, Policy):
         terms["value"] = value_loss(value, batch.target, batch.value, getattr(config, "clip_value", None))
     return terms
