@@ -1038,6 +1038,14 @@ def test_a_gradient_is_of_the_terms_of_its_loss(algorithm, fields, tmp_path):
         assert found["targets/discount"] == pytest.approx(0.99, abs=1e-5)
 
 
+def test_a_gradient_that_does_not_reach_the_policy_has_no_weight(tmp_path, monkeypatch):
+    right = ppo.clipped_surrogate
+    monkeypatch.setattr(ppo, "clipped_surrogate", lambda log_ratio, *given: right(log_ratio.detach(), *given))
+    found = looked_at("ppo", tmp_path)
+    assert found["gradient/policy"].max() == 0
+    assert found["gradient/value_rest"].max() < 1e-9
+
+
 def test_of_frozen_networks_nothing_is_said_and_of_the_others_all(tmp_path):
     found = looked_at("ppo", tmp_path, freeze=("policy",))
     assert "gradient/policy" not in found
@@ -1184,6 +1192,20 @@ KNOWN = {
     "other_rows": ("a2c", "loss", actions_of_others),
     "other_action": ("pqn", "loss", lambda right: lambda q, batch: right(q, replace(batch, action=1 - batch.action))),
     "online_target": ("ddpg", "critic_loss", online(False)),
+    "own_obs": (
+        "ddpg",
+        "critic_loss",
+        lambda right: lambda c, s, q, batch: right(c, s, q, replace(batch, next_obs=batch.obs)),
+    ),
+    "own_action": (
+        "td3",
+        "critic_loss",
+        lambda right: (
+            lambda c, s, q, batch, noise: right(
+                c, s, q, replace(batch, action=s.networks.policy(batch.obs).mode().detach()), noise
+            )
+        ),
+    ),
     "followed_target": ("ddpg", "critic_loss", online(True)),
 }
 

@@ -84,31 +84,44 @@ FAR = 3.0
 """the factor outside of its usual range from which on a setting is named"""
 
 CONSEQUENCES = {
-    "action-without-effect": {"acts-at-mode", "observation-repeated", "setting-initial-log-std"},
+    "action-without-effect": {
+        "observation-part",
+        "evaluated-otherwise",
+        "acts-at-mode",
+        "observation-repeated",
+        "setting-initial-log-std",
+    },
     "steps-short": {"observation-repeated", "exploding-observation"},
     "action-late": {"exploding-observation"},
     "reward-unexplained": {"exploding-observation"},
     "advantage-not-normalized": {"ratio-not-one", "loss-differs"},
-    "advantage-opposed": {"ratio-not-one", "targets-behind", "policy-still", "rows-of-others"},
+    "advantage-opposed": {"reward-large", "ratio-not-one", "targets-behind", "policy-still", "rows-of-others"},
     "targets-alike": {"critic-still"},
     "gradient-grows": {"value-runaway"},
-    "policy-still": {"units-inactive"},
+    "policy-still": {"units-inactive", "loss-differs"},
     "ends-continued": {"targets-differ"},
-    "advantage-unrelated": {"setting-learning-rate", "kl-too-large", "loss-differs", "rows-of-others"},
+    "advantage-unrelated": {"policy-still", "setting-learning-rate", "kl-too-large", "loss-differs", "rows-of-others"},
     "q-unfollowed": {"policy-still"},
     "evaluated-otherwise": {"too-few-episodes"},
     "acts-at-mode": {"advantage-opposed", "entropy-opposed"},
     "replay-differs": {"replay-repeated"},
     "setting-entropy-coef": {"entropy-opposed"},
-    "targets-of-others": {"critic-still", "replay-differs", "ends-continued", "loss-differs"},
-    "q-opposed": {"replay-differs"},
+    "targets-of-others": {"critic-still", "replay-differs", "ends-continued"},
+    "q-opposed": {"replay-differs", "loss-differs"},
     "replay-repeated": {"replay-part"},
     "gradient-clipped": {"loss-below-zero"},
     "missing-bootstrap": {"rate-zero"},
     "ends-ignored": {"ends-continued"},
     "entropy-collapsed": {"entropy-opposed"},
     "ratio-not-one": {"rows-of-others"},
-    "loss-differs": {"ends-continued", "loss-of-others", "rows-of-others", "targets-copied", "gradient-grows"},
+    "loss-differs": {
+        "targets-of-others",
+        "ends-continued",
+        "loss-of-others",
+        "rows-of-others",
+        "targets-copied",
+        "gradient-grows",
+    },
     "reward-small": {"setting-initial-log-std"},
 }
 """faults that are not named beside one of these, which brings them about"""
@@ -571,7 +584,7 @@ def of_batches(e: Evidence) -> Seen:
     if other > 0.01:
         yield "rows-of-others", f"In {other:.0%} of the rows of an update the action is not the one that was taken."
     if rest > 1e-8:
-        said = f"{100 * rest:.2g} % of the targets' squares do not follow from the rows after them"
+        said = f"{min(100.0, 100 * rest):.2g} % of the targets' squares do not follow from the rows after them"
         yield "targets-differ", f"{said}; rounding leaves 1e-12."
     elif isinstance(gamma, float) and abs(discount - gamma) > max(1e-3, 0.1 * (1 - gamma)):
         yield (
@@ -612,6 +625,8 @@ MISTAKES = {
     "ends_ignored": ("ends-continued", "of Q is that of targets with a value behind terminations"),
     "online_target": ("targets-copied", "of Q is that of targets of Q itself, without target networks"),
     "followed_target": ("loss-differs", "of Q goes through its own targets: these need a detach()"),
+    "own_obs": ("targets-of-others", "of Q is that of targets at s in the place of s'"),
+    "own_action": ("rows-of-others", "of Q is that of Q at the policy's actions in the place of those that were taken"),
     "other_action": ("rows-of-others", "is that of Q(s, ·) at other actions than were taken"),
     "other_rows": ("rows-of-others", "is that of an action, a reward, a target or a next observation of another row"),
 }
@@ -638,6 +653,8 @@ def of_gradients(e: Evidence) -> Seen:
         if rests[part] > ROUNDING:
             share = f"{100 * rests[part]:.2g} % of the squares of the gradient of {whose}"
             yield "loss-differs", f"No term of the loss explains {share}."
+        elif weights[part] == 0 and (part == "policy" or e.config.get("value_coef") != 0):
+            yield "loss-differs", f"The gradient of {whose} is 0, and that of the terms of the loss is not."
         elif weights[part] < 0:
             name = "advantage-opposed" if part == "policy" else "loss-differs"
             yield name, f"Training raises the loss of {whose} in place of lowering it."
@@ -967,7 +984,7 @@ def settings_far_out(e: Evidence) -> list[tuple[Rule, str]]:
             low, high = (e.recommended.get(field, 0) * each for each in times)
         factor = e.beyond(field, low, high)
         means = known.get("small" if factor < 0 else "large")
-        if abs(factor) < FAR or not means:
+        if abs(factor) < FAR - 1e-9 or not means:
             continue
         size = "far" if field in HORIZONS or np.isinf(factor) else f"{abs(factor):,.0f} times"
         side = "below" if factor < 0 else "above"

@@ -312,7 +312,9 @@ def of_gradient(
         own = {name: columns[name] for name in part if name in columns and columns[name].any()}
         moved = torch.stack([*own.values()]).any(0) if own else torch.zeros(len(gradient), dtype=torch.bool)
         whole = gradient.cpu().double()[moved]
-        if whole.any():
+        if part[0] in own and not whole.any():
+            found[f"gradient/{part[0]}"] = whole.sum()
+        elif whole.any():
             its = torch.stack([column[moved] for column in own.values()], 1)
             weights = torch.linalg.lstsq(its, whole[:, None], driver="gelsd").solution[:, 0]
             found[f"gradient/{part[0]}_rest"] = (whole - its @ weights).square().sum() / whole.square().sum()
@@ -350,6 +352,7 @@ def of_mistakes(
     - other_rows: an action, a target, a reward or a next observation is of the row beside, or of the reverse order.
     - other_action: Q(s, ·) of another action is moved.
     - online_target, followed_target: y is of Q itself; and the gradient goes through it.
+    - own_obs, own_action: y is of s in the place of s'; Q is of the policy's action in the place of the stored one.
     - not_zeroed: the gradient [P] is added to the one `before`, [P].
     """
     batch, *noise = args
@@ -374,6 +377,8 @@ def _mistaken(state: Any, batch: Any) -> Iterator[tuple[str, Any, Any]]:
         targets = state.networks if hasattr(state.targets, "critics") else state.networks.critics
         yield "online_target", Online(state.networks, targets, False), batch
         yield "followed_target", Online(state.networks, targets, True), batch
+        yield "own_obs", state, replace(batch, next_obs=batch.obs)
+        yield "own_action", state, replace(batch, action=state.networks.policy(batch.obs).mode().detach())
         if batch.terminated.any():
             yield "ends_ignored", state, replace(batch, terminated=torch.zeros_like(batch.terminated))
     if isinstance(batch, Batch | QBatch):
