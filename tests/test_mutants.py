@@ -1780,8 +1780,8 @@ MUTANTS = [
     (
         "of the variants of a mistake the worst counts",
         "run/updates.py",
-        "torch.stack(pair).max() for pair in rests]).min()",
-        "torch.stack(pair).max() for pair in rests]).max()",
+        ").min()\n        for name, variants in left.items()",
+        ").max()\n        for name, variants in left.items()",
         "run/test_signals.py::test_a_well_known_mistake_is_told_by_the_gradient_that_it_makes",
     ),
     (
@@ -1801,8 +1801,8 @@ MUTANTS = [
     (
         "the value of PQN's rows is that of the actions taken",
         "run/updates.py",
-        "value=self._state.networks.value(data.obs).detach()",
-        "value=data.value",
+        "value=self._state.networks.value(data.obs))",
+        "value=data.value)",
         "run/test_signals.py::test_a_gradient_is_of_the_terms_of_its_loss",
     ),
 ]

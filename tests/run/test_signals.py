@@ -988,6 +988,7 @@ def looked_at(algorithm, tmp_path, env="CartPole-v1", **fields):
             "InvertedPendulum-v5",
             {"total_steps": 1000, "learning_starts": 100, "batch_size": 32, "log_every": 50},
         )
+        small |= {"hidden": (16,), "critic_hidden": (16,)}
     small |= {"minibatch_size": 16} if algorithm in ("ppo", "reppo", "pqn") else {}
     small |= {"critic_minibatch_size": 16} if algorithm in ("trpo", "reinforce") else {}
     env = "Pendulum-v1" if algorithm == "reppo" else env
