@@ -59,6 +59,55 @@ def names(*args, **kwargs):
     return [one.name for one in diagnose(evidence(*args, **kwargs)) if one.sure != HINT]
 
 
+EXACT = {
+    # what is seen: the rule, evidence in which it fires, evidence just beside it
+    "an action that was not taken": (
+        "rows-of-others",
+        {"targets__other_actions": 0.5},
+        {"targets__other_actions": 0.0},
+    ),
+    "another policy than acted": ("ratio-not-one", {"gradient__old_policy": 0.1}, {"gradient__old_policy": 1e-5}),
+    "a loss that is raised": (
+        "advantage-opposed",
+        {"gradient__policy": -1.0, "gradient__policy_rest": 0.0},
+        {"gradient__policy": 1.0, "gradient__policy_rest": 0.0},
+    ),
+    "an error that is raised": ("loss-differs", {"gradient__value": -1.0}, {"gradient__value": 1.0}),
+    "no gradient": ("loss-differs", {"gradient__policy": 0.0}, {"gradient__policy": 1.0}),
+    "a value that weighs too much": (
+        "loss-differs",
+        {"gradient__policy": 1.0, "gradient__value": 4.0},
+        {"gradient__policy": 1.0, "gradient__value": 2.0},
+    ),
+    "an entropy that is punished": ("entropy-opposed", {"gradient__entropy": -0.01}, {"gradient__entropy": 0.01}),
+    "a bootstrap that lacks": ("missing-bootstrap", {"targets__missing": 1.0}, {"targets__missing": 0.0}),
+    "a bootstrap of twice": ("targets-differ", {"targets__missing": -1.0}, {"targets__missing": 0.0}),
+    **{
+        mistake: (name, {f"gradient__if_{mistake}": 1e-12}, {f"gradient__if_{mistake}": 1e-3})
+        for mistake, (name, _) in rules.MISTAKES.items()
+    },
+}
+
+
+@pytest.mark.parametrize("case", EXACT)
+def test_what_equations_show_is_named(case):
+    name, there, beside = EXACT[case]
+    assert name in names(**{metric: [value] * 3 for metric, value in there.items()})
+    assert name not in names(**{metric: [value] * 3 for metric, value in beside.items()})
+
+
+def test_an_evaluation_with_another_time_limit_is_named():
+    longer = {"evaluation__length": [100.0] * 8}
+    assert "evaluated-otherwise" in names(lengths=[25] * 400, **longer)
+    assert "evaluated-otherwise" not in names(lengths=[25, *range(5, 24)] * 20, **longer), "most episodes ended before"
+    assert "evaluated-otherwise" not in names(lengths=[80] * 400, **longer)
+
+
+def test_one_lucky_episode_does_not_hide_an_evaluation_of_another_kind():
+    worse = {"mean_return": -100.0, "returns": [-100.0] * 20}
+    assert "evaluated-otherwise" in names(returns=[1000.0, *FLAT[1:]], scores=worse)
+
+
 CASES = {
     # rule: evidence in which it fires, evidence just beside it
     "rate-zero": ({"learning_rate": [1e-3] + [0.0] * 7}, {"learning_rate": [1e-3] * 7 + [0.0]}),

@@ -660,12 +660,10 @@ def of_gradients(e: Evidence) -> Seen:
             yield name, f"Training raises the loss of {whose} in place of lowering it."
             return
     entropy, coef = e.values("gradient/entropy"), first_number(e.config.get("value_coef"))
-    if coef and not FAR > weights["value"] / weights["policy"] / coef > 1 / FAR and weights["policy"] > 0:
-        times = weights["value"] / weights["policy"]
-        yield (
-            "loss-differs",
-            f"The loss of V weighs {times:.2g} times that of the policy, and is to weigh {coef:g} times.",
-        )
+    times = weights["value"] / weights["policy"] if weights["policy"] > 0 else np.nan
+    if coef and (times > FAR * coef or times < coef / FAR):
+        said = f"The loss of V weighs {times:.2g} times that of the policy"
+        yield "loss-differs", f"{said}, and is to weigh {coef:g} times."
     surer = len(entropy) >= 2 and entropy.max() < 1e-5 and np.median(entropy) < -1e-4
     if surer and not rests["policy"] > ROUNDING:
         yield "entropy-opposed", f"The gradient lowers the entropy: that is {-np.median(entropy):.1%} of its length."

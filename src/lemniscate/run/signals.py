@@ -19,7 +19,7 @@ from lemniscate.nn.actor_critic import of_next
 from lemniscate.nn.networks import ACTIVATIONS
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.run.config import RunConfig
-from lemniscate.run.updates import Watched, of_batch, of_cuts, of_update, spread
+from lemniscate.run.updates import Watched, of_batch, of_update, old_value_of, spread
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 from lemniscate.types import Rollout, Transition
 
@@ -76,8 +76,7 @@ def signals(
     found = of_networks(state, chosen) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
     found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled))
     if watched:
-        found |= of_batch(config, watched.given, scaled) | of_cuts(state, config, scaled, acted, watched.given)
-        found |= watched.found
+        found |= of_batch(config, watched.given, scaled, old_value_of(state, acted)) | watched.found
     return of_environment(rows, spec, ages) | {name: float(value) for name, value in found.items()}
 
 

@@ -5,7 +5,7 @@ one with a mistake in a loss, in the targets or in the order of rows does not, w
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -154,10 +154,10 @@ def of_update(state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, 
         if own:
             before, after = (torch.cat([x.flatten() for x in each]) for each in zip(*own, strict=True))
             found[name] = (after - before).norm() / after.norm()
-    if not isinstance(networks.value, nn.Module):  # but the largest of Q
+    if not (old_value := old_value_of(state, acted)):  # but the largest of Q
         return found
-    parts = [{key.removeprefix(of): x for key, x in acted.items() if key.startswith(of)} for of in PARTS]
-    old, old_value = (partial(_of_old, *each) for each in zip((state.policy, networks.value), parts, strict=True))
+    before = {key.removeprefix(PARTS[0]): x for key, x in acted.items() if key.startswith(PARTS[0])}
+    old = partial(_of_old, state.policy, before)
     rows = rows[-getattr(config, "num_steps", len(rows.done)) :]  # REINFORCE collects whole episodes
     obs, action, done, newest = rows.obs.flatten(0, 1), rows.action.flatten(0, 1), rows.done, rows.valid
     value, gamma = old_value(obs).view(done.shape), getattr(config, "gamma", 1.0)
@@ -174,12 +174,24 @@ def of_update(state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, 
     return found
 
 
+def old_value_of(state: Any, acted: Mapping[str, Tensor] | None) -> Callable[[Tensor], Tensor] | None:
+    """V(s) as it was before the newest update, [B, O] to [B]; None where there is none, or it is not known."""
+    value = getattr(state.networks, "value", None)
+    if acted is None or not isinstance(value, nn.Module):
+        return None
+    return partial(
+        _of_old, value, {key.removeprefix(PARTS[1]): x for key, x in acted.items() if key.startswith(PARTS[1])}
+    )
+
+
 def _of_old(module: nn.Module, tensors: Mapping[str, Tensor], obs: Tensor) -> Any:
     """What a module says with other parameters and buffers."""
     return functional_call(module, dict(tensors), (obs,), tie_weights=False)
 
 
-def of_batch(config: RunConfig, given: Given, rows: Rollout) -> dict[str, Tensor]:
+def of_batch(
+    config: RunConfig, given: Given, rows: Rollout, old_value: Callable[[Tensor], Tensor] | None = None
+) -> dict[str, Tensor]:
     """Of the rows that an update learned from, where they are the newest, [T, N, …]: whether they follow from these.
 
     - targets/discount: the factor by which targets follow from the values and the targets of the row after.
@@ -189,6 +201,7 @@ def of_batch(config: RunConfig, given: Given, rows: Rollout) -> dict[str, Tensor
     - advantage/used: that of the advantages in the first gradient step with those of its rows.
     - value/loss: half the mean of the squared differences of values and targets, in an update of one gradient step.
     - targets/other_actions: the share of the rows whose action is not the one that was taken.
+    - targets/missing: see `of_cuts`; where V before the update, `old_value`, is known.
 
     Of PQN the value is the largest Q(s, ·), and there are no advantages.
     """
@@ -210,6 +223,7 @@ def of_batch(config: RunConfig, given: Given, rows: Rollout) -> dict[str, Tensor
         found["targets/unexplained"] = (rest - found["targets/discount"] * ahead).square().mean() / size
     if size > 0 and ends.any():
         found["targets/beyond_ends"] = beyond[ends].square().mean() / size
+    found |= of_cuts(config, newest, g, old_value) if old_value else {}
     pairs = {"advantage/own": (a[0][newest.valid], (g - v)[newest.valid])} if a else {}
     if by_step and a:
         value, target, advantage = (x.flatten()[by_step[0][0].flatten()] for x in columns)
@@ -223,25 +237,20 @@ def of_batch(config: RunConfig, given: Given, rows: Rollout) -> dict[str, Tensor
 
 
 def of_cuts(
-    state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None, given: Given
+    config: RunConfig, rows: Rollout, target: Tensor, old_value: Callable[[Tensor], Tensor]
 ) -> dict[str, Tensor]:
-    """The share of γ V(s') that targets lack where a time limit, or the end of the newest rows, cuts an episode.
+    """The share of γ V(s') that targets [T, N] lack where a time limit, or the end of the rows, cuts an episode.
 
-    Of rows [T, N, …] and of V before the update, whose targets they are.
+    Of rows [T, N, …], and of V before the update, whose targets they are.
     """
-    columns, value = _columns_of(config, given[0], rows), getattr(state.networks, "value", None)
-    if not columns or acted is None or not isinstance(value, nn.Module):
-        return {}
-    steps = min(len(columns[0]), len(rows.done))
-    newest, beyond = rows[-steps:], columns[1][-steps:] - rows.reward[-steps:]
-    cut = newest.done.clone()
+    cut = rows.done.clone()
     cut[-1] = True
-    cut &= newest.valid & ~newest.terminated
-    own = {key.removeprefix(PARTS[1]): x for key, x in acted.items() if key.startswith(PARTS[1])}
-    ahead = getattr(config, "gamma", 1.0) * _of_old(value, own, newest.next_obs[cut]).to(beyond.dtype)
-    if ahead.square().sum() <= 1e-6 * columns[1][-steps:][cut].square().sum():  # else it is of rounding
+    cut &= rows.valid & ~rows.terminated
+    beyond = (target - rows.reward)[cut]
+    ahead = getattr(config, "gamma", 1.0) * old_value(rows.next_obs[cut]).to(target.dtype)
+    if ahead.square().sum() <= 1e-6 * target[cut].square().sum():  # else it is of rounding
         return {}
-    return {"targets/missing": 1 - (beyond[cut] * ahead).sum() / ahead.square().sum()}
+    return {"targets/missing": 1 - (beyond * ahead).sum() / ahead.square().sum()}
 
 
 def _columns_of(config: RunConfig, data: Any, rows: Rollout) -> list[Tensor]:
@@ -294,8 +303,8 @@ def of_gradient(
 
     - gradient/policy, gradient/value: the weights of the terms in which actions, and V or Q, are judged.
     - gradient/entropy: the part that raises the entropy, as a signed share of the length of the policy's gradient.
-    - gradient/policy_rest, gradient/value_rest: the share of the squares that is of no term, among the parameters that
-      the terms move.
+    - gradient/policy_rest, gradient/value_rest: the share of the squares that no term explains, among the parameters
+      that the terms move.
     """
     parameters, found = optimizer.parameters, dict[str, Tensor]()
     if len(gradient) > MOST_PARAMETERS or any(isinstance(m, Bfloat16Linear) for m in optimizer.networks.modules()):
@@ -417,7 +426,7 @@ def terms_of(config: Any, state: Any, networks: Any, batch: Any, *noise: Tensor)
         loss = networks.loss(batch.obs, *pair)[0] if soft else value_loss(networks.q(batch.obs, pair[0]), pair[1])
         return {"value": loss}
     if isinstance(batch, Transition) and isinstance(networks, Critics):
-        with torch.set_grad_enabled(getattr(state, "follows", False)):
+        with torch.set_grad_enabled(isinstance(state, Online) and state.follows):
             target = _target_of_q(config, state, batch, *noise)
         return {"value": torch.stack([q.loss(batch.obs, batch.action, target)[0] for q in networks.members]).sum()}
     if isinstance(batch, Transition) and isinstance(networks, Policy):
