@@ -23,7 +23,7 @@ import shutil
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -43,6 +43,7 @@ from lemniscate import presets
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.run import run as loop
+from lemniscate.run import updates
 from lemniscate.run.fields import read
 
 ON = {"CartPole-v1": 50_000, "LunarLander-v3": 120_000, "HalfCheetah-v5": 120_000}
@@ -347,16 +348,25 @@ def cured(name: str, env: str, seed: int, folder: Path) -> list[float]:
 
 
 def cost() -> None:
-    """The share of training that the signals take, measured inside the run, one thread."""
-    measure, spent = loop.signals, [0.0]
+    """The share of training that the signals take, those of gradients too, measured inside the run, one thread."""
+    spent, inside = [0.0], [False]
 
-    def timed(*args: Any) -> dict[str, float]:
-        began = time.perf_counter()
-        found = measure(*args)
-        spent[0] += time.perf_counter() - began
-        return found
+    def timed(measure: Callable[..., Any]) -> Callable[..., Any]:
+        def of(*args: Any, **rest: Any) -> Any:
+            if inside[0]:  # one of them calls another
+                return measure(*args, **rest)
+            inside[0], began = True, time.perf_counter()
+            try:
+                return measure(*args, **rest)
+            finally:
+                spent[0] += time.perf_counter() - began
+                inside[0] = False
 
-    loop.signals = timed
+        return of
+
+    loop.signals, loop.acted_with = timed(loop.signals), timed(loop.acted_with)
+    for name in ("of_minibatch", "of_old_policy", "of_gradient", "of_mistakes"):
+        setattr(updates, name, timed(getattr(updates, name)))
     for algorithm, env, steps in (
         ("ppo", "CartPole-v1", 50_000),
         ("ppo", "HalfCheetah-v5", 200_000),

@@ -82,6 +82,19 @@ EXACT = {
     "an entropy that is punished": ("entropy-opposed", {"gradient__entropy": -0.01}, {"gradient__entropy": 0.01}),
     "a bootstrap that lacks": ("missing-bootstrap", {"targets__missing": 1.0}, {"targets__missing": 0.0}),
     "a bootstrap of twice": ("targets-differ", {"targets__missing": -1.0}, {"targets__missing": 0.0}),
+    "another λ": ("discount-differs", {"targets__trace": 0.5}, {"targets__trace": 0.95}),
+    "a discount where targets do not follow": (
+        "discount-differs",
+        {"targets__discount": 0.9, "targets__unexplained": 1.0, "targets__trace": 0.95},
+        {"targets__discount": 0.9, "targets__unexplained": 1.0},
+    ),
+    "an entropy that is taken off targets": ("entropy-opposed", {"targets__entropy": -1.0}, {"targets__entropy": 1.0}),
+    "an entropy that targets lack": ("loss-differs", {"targets__entropy": 0.0}, {"targets__entropy": 1.0}),
+    "another loss once the policy has moved": (
+        "loss-differs",
+        {"gradient__later_rest": 1e-3},
+        {"gradient__later_rest": 1e-9},
+    ),
     **{
         mistake: (name, {f"gradient__if_{mistake}": 1e-12}, {f"gradient__if_{mistake}": 1e-3})
         for mistake, (name, _) in rules.MISTAKES.items()
@@ -125,6 +138,13 @@ CASES = {
         {"algorithm": "a2c", "losses__value": list(np.linspace(1, 3, 8)), "value__loss": [1.0] * 8},
         {"algorithm": "a2c", "losses__value": [2.0] * 8, "value__loss": [1.0] * 8},
     ),
+    "rewards-differ": ({"targets__other_rewards": [0.1] * 2}, {"targets__other_rewards": [1e-12] * 2}),
+    "targets-forward": ({"targets__forward": [1.0] * 2}, {"targets__forward": [0.0] * 2}),
+    "critics-not-least": (
+        {"algorithm": "sac", "gradient__if_other_critic": [1e-12] * 2},
+        {"algorithm": "sac", "gradient__if_other_critic": [1e-3] * 2},
+    ),
+    "clip-ignored": ({"gradient__if_no_clip": [1e-12] * 2}, {"gradient__if_no_clip": [1e-3] * 2}),
     "rows-of-others": ({"gradient__other_rows": [0.5] * 3}, {"gradient__other_rows": [0.0] * 3}),
     "targets-copied": (
         {"algorithm": "td3", "targets__behind": [0.0] * 4, "targets__length": [1.0, 2.0, 3.0, 4.0]},

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import gymnasium as gym
@@ -941,6 +942,19 @@ def advantages(reward, value, *rest):
     return gae(reward, value, *rest, gamma=gamma, lam=lam)
 
 
+def near(number):
+    return pytest.approx(number, abs=1e-3)
+
+
+def forward(reward, value, next_value, terminated, done, gamma, lam):
+    """Advantages that follow from those of the row before."""
+    delta, found = reward + gamma * next_value * ~terminated - value, []
+    for t in range(len(delta)):
+        chained = gamma * lam * ~done[t - 1] * found[-1] if t else 0.0
+        found.append(delta[t] + chained)
+    return torch.stack(found), torch.stack(found) + value
+
+
 MISTAKES = {
     "1 / gamma": (
         lambda *given: advantages(*given[:-2], 1 / given[-2], given[-1]),
@@ -956,6 +970,19 @@ MISTAKES = {
         ),
         lambda found: min(found["targets/beyond_ends"]) > 0.01,
     ),
+    "rewards less their mean": (
+        lambda reward, *given: advantages(reward * 2 - 1, *given),
+        lambda found: min(found["targets/other_rewards"]) > 1e-3 and found["targets/discount"][0] == near(0.99),
+    ),
+    "another λ": (
+        lambda *given: advantages(*given[:-1], 0.6),
+        lambda found: found["targets/trace"][0] == near(0.6) and found["targets/other_rewards"][0] < 1e-6,
+    ),
+    "another λ and γ": (
+        lambda *given: advantages(*given[:-2], 0.9, 0.5),
+        lambda found: found["targets/trace"][0] == near(0.5) and found["targets/discount"][0] == near(0.9),
+    ),
+    "from the first row on": (lambda *given: forward(*given), lambda found: set(found["targets/forward"]) == {1.0}),
     "no baseline": (
         lambda reward, value, *given: (lambda target: (target + 3 * value, target))(
             advantages(reward, value, *given)[1]
@@ -1002,7 +1029,7 @@ def looked_at(algorithm, tmp_path, env="CartPole-v1", **fields):
 @pytest.mark.parametrize(
     ("algorithm", "fields"),
     [
-        ("ppo", {"entropy_coef": 0.01}),
+        ("ppo", {"entropy_coef": 1.0, "clip": 1e-4}),
         ("ppo", {"network": "gru", "sequence_length": 8, "clip_value": 0.2}),
         ("ppo", {"compile": "on", "env": "Pendulum-v1"}),
         ("a2c", {"entropy_coef": "0.1>0.01"}),
@@ -1023,6 +1050,7 @@ def test_a_gradient_is_of_the_terms_of_its_loss(algorithm, fields, tmp_path):
     assert found["gradient/other_rows"].max() == 0
     if algorithm in ("ppo", "reppo"):
         assert found["gradient/old_policy"].max() < 1e-5
+        assert found["gradient/later_rest"].max() < 1e-9
     if algorithm in ("ppo", "a2c", "trpo", "reinforce") and fields.get("network") != "gru":
         assert abs(found["targets/missing"]).max() < 1e-5
     heads = {"trpo": ("value",), "pqn": ("value",)}.get(algorithm, ("policy", "value"))
@@ -1083,7 +1111,7 @@ def test_a_learner_of_ones_own_may_leave_no_gradients_and_take_other_arguments(t
     monkeypatch.setattr(ppo, "learn", learn)
     assert looked_at("ppo", tmp_path)
     state = SimpleNamespace(learn=lambda *args: args, optimizers=list)
-    watched = Watched(state, True)
+    watched = Watched(state, 0)
     assert state.learn(1, 2, 3) == (1, 2, 3)
     assert watched.found == {}
 
@@ -1208,7 +1236,27 @@ KNOWN = {
         ),
     ),
     "followed_target": ("ddpg", "critic_loss", online(True)),
+    "other_critic": (
+        "sac",
+        "critic_loss",
+        lambda right: lambda c, s, *rest: right(c, Largest(s.networks, s.targets), *rest),
+    ),
+    "no_clip": (
+        "ppo",
+        "clipped_surrogate",
+        lambda right: lambda log_ratio, advantage, _: right(log_ratio, advantage, 1e6),
+    ),
 }
+
+
+class Largest(NamedTuple):
+    """A state whose target networks say the larger of what they say."""
+
+    networks: Any
+    critics: Any
+
+    def targets(self, obs, action):
+        return self.critics(obs, action).amax(0, keepdim=True)
 
 
 @pytest.mark.parametrize("mistake", KNOWN)
@@ -1216,10 +1264,44 @@ def test_a_well_known_mistake_is_told_by_the_gradient_that_it_makes(mistake, tmp
     algorithm, name, wrong = KNOWN[mistake]
     module = algos.find(algorithm)
     monkeypatch.setattr(module, name, wrong(getattr(module, name)))
-    found = looked_at(algorithm, tmp_path)
+    fields = {"clip": 1e-4} if mistake == "no_clip" else {}
+    found = looked_at(algorithm, tmp_path, **fields)
     assert found[f"gradient/if_{mistake}"].max() < 1e-9
     others = KNOWN.keys() - {mistake, "other_action"}  # of which one may be right by chance, where there are two
     assert all(found[other].max() > 1e-6 for each in others if (other := f"gradient/if_{each}") in found)
+
+
+@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
+@pytest.mark.parametrize(("times", "discount"), [(0.5, 0.99), (1.0, 0.9)])
+def test_the_discount_and_the_rewards_in_targets_of_q_are_told_by_the_gradient(
+    times, discount, algorithm, tmp_path, monkeypatch
+):
+    module = algos.find(algorithm)
+    monkeypatch.setattr(
+        module,
+        "td_target",
+        lambda reward, after, ends, *, gamma: td_target(times * reward, after, ends, gamma=discount),
+    )
+    found = looked_at(algorithm, tmp_path)
+    assert found["targets/discount"] == near(discount)
+    assert found["targets/other_rewards"] == pytest.approx(1.0 if times == 0.5 else 0.0, abs=1e-5)
+    assert "targets/entropy" not in found
+
+
+@pytest.mark.parametrize("times", [-1.0, 0.0])
+def test_an_entropy_that_targets_of_q_take_otherwise_is_told_by_the_gradient(times, tmp_path, monkeypatch):
+    def critic_loss(config, state, critics, batch, noise):
+        action, log_prob = state.networks.policy(batch.next_obs).sample_with_log_prob(noise)
+        bonus = -times * state.networks.temperature() * log_prob
+        after = state.targets(batch.next_obs, action).amin(0) + bonus
+        target = td_target(batch.reward, after, batch.terminated, gamma=config.gamma).detach()
+        loss = sum(each.loss(batch.obs, batch.action, target)[0] for each in critics.members)
+        return loss, {"losses/critic": loss.detach(), "q": loss.detach()}
+
+    monkeypatch.setattr(algos.find("sac"), "critic_loss", critic_loss)
+    found = looked_at("sac", tmp_path)
+    assert found["targets/entropy"] == near(times)
+    assert found["targets/discount"] == near(0.99)
 
 
 def test_a_gradient_that_is_added_up_is_told(tmp_path, monkeypatch):
@@ -1277,7 +1359,7 @@ def test_the_largest_q_follows_in_the_targets_of_q(tmp_path, monkeypatch):
 def test_the_loss_of_a_single_step_is_half_the_mean_squared_error(tmp_path):
     lines = read_metrics(
         lem.train(
-            "a2c", "CartPole-v1", run=tmp_path / "run", num_envs=4, num_steps=16, total_steps=640, progress=False
+            "a2c", "CartPole-v1", run=tmp_path / "run", num_envs=4, num_steps=16, total_steps=1280, progress=False
         ).path
     )
     pairs = [(line["losses/value"], line["value/loss"]) for line in lines if "value/loss" in line]
@@ -1297,7 +1379,7 @@ def test_watching_ends_with_the_update(tmp_path):
 
     with patch.object(ppo, "update", noted):
         lem.train("ppo", "CartPole-v1", run=tmp_path / "run", progress=False, **tiny_fields(total_steps=32 * 8))
-    assert seen == ["Watched", *["function"] * 3, "Watched", *["function"] * 3]
+    assert seen == ["Watched", *["function"] * 4, "Watched", *["function"] * 2]
 
 
 class OwnSteps:

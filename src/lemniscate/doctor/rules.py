@@ -21,7 +21,8 @@ import numpy as np
 
 from lemniscate.doctor.evidence import HORIZONS, Evidence, first_number, last_number
 from lemniscate.run.fields import field_of, flag, typed
-from lemniscate.run.updates import ROUNDING
+from lemniscate.run.terms import ROUNDING
+from lemniscate.run.updates import OF_TARGETS
 
 Seen = Iterator[tuple[str, str]]
 """names of faults, each with what was seen of it"""
@@ -99,7 +100,7 @@ CONSEQUENCES = {
     "targets-alike": {"critic-still"},
     "gradient-grows": {"value-runaway"},
     "policy-still": {"units-inactive", "loss-differs"},
-    "ends-continued": {"targets-differ"},
+    "ends-continued": {"targets-differ", "rewards-differ", "targets-forward"},
     "advantage-unrelated": {"policy-still", "setting-learning-rate", "kl-too-large", "loss-differs", "rows-of-others"},
     "q-unfollowed": {"policy-still"},
     "evaluated-otherwise": {"too-few-episodes"},
@@ -110,8 +111,12 @@ CONSEQUENCES = {
     "q-opposed": {"replay-differs", "loss-differs"},
     "replay-repeated": {"replay-part"},
     "gradient-clipped": {"loss-below-zero"},
-    "missing-bootstrap": {"rate-zero"},
+    "missing-bootstrap": {"rate-zero", "rewards-differ", "targets-forward", "discount-differs"},
     "ends-ignored": {"ends-continued"},
+    "targets-differ": {"rewards-differ", "targets-forward", "discount-differs"},
+    "kl-too-large": {"clip-ignored"},
+    "ratios-clipped": {"clip-ignored"},
+    "q-biased": {"critics-not-least"},
     "entropy-collapsed": {"entropy-opposed"},
     "ratio-not-one": {"rows-of-others"},
     "loss-differs": {
@@ -121,6 +126,11 @@ CONSEQUENCES = {
         "rows-of-others",
         "targets-copied",
         "gradient-grows",
+        "rewards-differ",
+        "discount-differs",
+        "entropy-opposed",
+        "critics-not-least",
+        "clip-ignored",
     },
     "reward-small": {"setting-initial-log-std"},
 }
@@ -404,7 +414,7 @@ def of_ratios(e: Evidence) -> Seen:
                 f"The KL divergence of the last updates is {last:.2g}, and was {usual:.2g}, although the learning rate"
                 f" has fallen to {rates[-tenth:].mean() / rates[0]:.0%} of what it was.",
             )
-    elif other > max(4 * kl, 1e-3):  # both are unbiased where the old policy acted
+    elif len(every) >= 6 and other > max(4 * kl, 1e-3):  # both are unbiased where the old policy acted
         yield (
             "ratio-not-one",
             f"The two estimates of the KL divergence are {other:.2g} and {kl:.2g}: the actions are not those of the old"
@@ -578,19 +588,13 @@ def of_batches(e: Evidence) -> Seen:
     """Whether targets follow from the rows of an update: equations that every healthy run fulfils."""
     if not _has_targets(e):
         return
-    names = ("unexplained", "discount", "beyond_ends", "missing", "other_actions")
-    rest, discount, beyond, missing, other = (e.median(f"targets/{name}") for name in names)
-    gamma = e.config.get("gamma")
+    names = ("unexplained", "beyond_ends", "missing", "other_actions")
+    rest, beyond, missing, other = (e.median(f"targets/{name}") for name in names)
     if other > 0.01:
         yield "rows-of-others", f"In {other:.0%} of the rows of an update the action is not the one that was taken."
-    if rest > 1e-8:
+    if rest > OF_TARGETS:
         said = f"{min(100.0, 100 * rest):.2g} % of the targets' squares do not follow from the rows after them"
         yield "targets-differ", f"{said}; rounding leaves 1e-12."
-    elif isinstance(gamma, float) and abs(discount - gamma) > max(1e-3, 0.1 * (1 - gamma)):
-        yield (
-            "discount-differs",
-            f"From row to row targets are discounted by {discount:.4g}, not by {gamma:g}.",
-        )
     cut = "Where a time limit or a rollout's end cuts an episode, targets"
     if missing > 0.01:
         yield "missing-bootstrap", f"{cut} lack {missing:.0%} of the value that follows."
@@ -598,6 +602,26 @@ def of_batches(e: Evidence) -> Seen:
         yield "targets-differ", f"{cut} have {1 - missing:.2g} times the value that follows."
     if beyond > 0.01:
         yield "ends-continued", f"{beyond:.0%} of the squares of the targets at terminations are not the reward's."
+
+
+def of_parts_of_targets(e: Evidence) -> Seen:
+    """Of which numbers the targets of V or Q are made: rewards, γ, λ and entropies, to rounding."""
+    names = ("discount", "trace", "other_rewards", "entropy")
+    discount, trace, other, entropy = (e.median(f"targets/{name}", 2) for name in names)
+    gamma, lam = (first_number(e.config.get(name)) for name in ("gamma", "gae_lambda"))
+    lam = first_number(e.config.get("td_lambda")) if lam is None else lam
+    exact = not e.median("targets/unexplained") > OF_TARGETS or trace == trace
+    if other > ROUNDING:
+        yield "rewards-differ", f"In the targets there are other rewards than were paid: {other:.2g} of their squares."
+    if e.values("targets/forward").any():
+        yield "targets-forward", "Targets follow from the rows before them."
+    if gamma is not None and exact and abs(discount - gamma) > max(1e-3, 0.1 * (1 - gamma)):
+        yield "discount-differs", f"From row to row targets are discounted by {discount:.4g}, not by {gamma:g}."
+    elif lam is not None and abs(trace - lam) > 0.01:
+        yield "discount-differs", f"Targets are made with a λ of {trace:.3g}, not of {lam:g}."
+    if abs(entropy - 1) > 0.01:
+        name = "entropy-opposed" if entropy < 0 else "loss-differs"
+        yield name, f"In the targets of Q the entropy of the next action counts {entropy:.2g} times."
 
 
 def of_used_advantages(e: Evidence) -> Seen:
@@ -629,8 +653,10 @@ MISTAKES = {
     "own_action": ("rows-of-others", "of Q is that of Q at the policy's actions in the place of those that were taken"),
     "other_action": ("rows-of-others", "is that of Q(s, ·) at other actions than were taken"),
     "other_rows": ("rows-of-others", "is that of an action, a reward, a target or a next observation of another row"),
+    "other_critic": ("critics-not-least", "of Q is that of targets of the larger of two critics, their mean, or one"),
+    "no_clip": ("clip-ignored", "is that of ratios, or of values, that nothing clips"),
 }
-"""mistakes that `run/updates.py` tries where no term explains a gradient; each with its rule and what is seen"""
+"""mistakes that `run/terms.py` tries where no term explains a gradient; each with its rule and what is seen"""
 
 
 def of_first_steps(e: Evidence) -> Seen:
@@ -641,7 +667,7 @@ def of_first_steps(e: Evidence) -> Seen:
         what = "KL(π_old ‖ π)" if "min_temperature" in e.config else "|log π − log π_old|"
         yield "ratio-not-one", f"Before the first gradient step of an update {what} is already {apart:.2g}."
     for mistake, (name, what) in MISTAKES.items():
-        if e.median(f"gradient/if_{mistake}", 2) < ROUNDING:
+        if e.median(f"gradient/if_{mistake}", 1) < ROUNDING:
             yield name, f"To rounding, the gradient {what}."
 
 
@@ -659,6 +685,9 @@ def of_gradients(e: Evidence) -> Seen:
             name = "advantage-opposed" if part == "policy" else "loss-differs"
             yield name, f"Training raises the loss of {whose} in place of lowering it."
             return
+    if (later := e.median("gradient/later_rest", 1)) > ROUNDING:
+        share = f"{100 * later:.2g} % of the squares of a gradient"
+        yield "loss-differs", f"Once the policy has moved, no term of the loss explains {share}: its clip, or its KL."
     entropy, coef = e.values("gradient/entropy"), first_number(e.config.get("value_coef"))
     times = weights["value"] / weights["policy"] if weights["policy"] > 0 else np.nan
     if coef and (times > FAR * coef or times < coef / FAR):
@@ -941,6 +970,7 @@ def of_evaluations(e: Evidence) -> Seen:
 SUBJECTS = (
     of_first_steps,  # first what is exact
     of_gradients,
+    of_parts_of_targets,
     of_batches,
     of_used_advantages,
     of_observations,

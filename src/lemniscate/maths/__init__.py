@@ -12,8 +12,23 @@ from lemniscate.maths.distributions import (
     mean_and_std,
     tanh,
 )
-from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
-from lemniscate.maths.returns import episode_return, gae, q_lambda, reward_to_go
+from lemniscate.maths.losses import (
+    clipped_surrogate,
+    cross_entropy,
+    hl_gauss,
+    policy_gradient,
+    surrogate,
+    value_loss,
+)
+from lemniscate.maths.returns import (
+    episode_return,
+    gae,
+    polyak,
+    q_lambda,
+    reward_to_go,
+    soft_lambda_return,
+    td_target,
+)
 from lemniscate.maths.stats import (
     clip_fraction,
     explained_by,
@@ -27,7 +42,6 @@ from lemniscate.maths.stats import (
     ratio_statistics,
     standardize,
 )
-from lemniscate.maths.targets import cross_entropy, hl_gauss, polyak, soft_lambda_return, td_target
 from lemniscate.maths.trust_region import backtrack, conjugate_gradient, fisher_product, natural_step
 
 __all__ = sorted(name for name, value in vars().items() if callable(value))  # pyright: ignore[reportUnsupportedDunderAll]

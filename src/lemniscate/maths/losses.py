@@ -1,4 +1,4 @@
-"""Losses: scalars to descend. They raise `ValueError` for tensors whose shapes differ."""
+"""Losses: scalars to descend; targets over bins. They raise `ValueError` for tensors whose shapes differ."""
 
 from typing import Any
 
@@ -89,3 +89,29 @@ def value_loss(
         clipped = old_value + (value - old_value).clamp(-clip, clip)
         error = torch.max(error, (clipped - target).square())
     return 0.5 * error.mean()
+
+
+def hl_gauss(target: Float[Tensor, " *B"], edges: Float[Tensor, " E"], width: float = 0.75) -> Float[Tensor, "*B K"]:
+    """A number as probabilities of K bins: Farebrother et al. 2024, arXiv:2403.03950, "HL-Gauss".
+
+        p_i = (Φ((e_{i+1} − y) / σ) − Φ((e_i − y) / σ)) / (Φ((e_K − y) / σ) − Φ((e_0 − y) / σ))
+
+    Args:
+        target: y, which is clamped to [e_0, e_K].
+        edges: e_0 < … < e_K, at equal distances; E = K + 1.
+        width: σ in units of a bin's width.
+    """
+    sigma = width * (edges[1] - edges[0])
+    below = torch.erf((edges - target.clamp(edges[0], edges[-1])[..., None]) / (sigma * 2**0.5))
+    return below.diff() / (below[..., -1:] - below[..., :1])
+
+
+def cross_entropy(logits: Float[Tensor, "*B K"], target: Float[Tensor, "*B K"]) -> Float[Tensor, ""]:
+    """−E[ Σ_i p_i log q_i ]: the loss of a distribution over K bins, arXiv:2403.03950, section 2.
+
+    Args:
+        logits: of q.
+        target: p, no gradient.
+    """
+    require_alike(logits=logits, target=target)
+    return -(target * logits.log_softmax(-1)).sum(-1).mean()

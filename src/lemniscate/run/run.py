@@ -36,7 +36,7 @@ from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, Logger, LoggerClass, require_logger
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.seeding import derive, seed_globals
-from lemniscate.run.signals import LOOKS, is_close, signals
+from lemniscate.run.signals import EVERY_CLOSE, FIRST_CLOSE, LOOKS, signals
 from lemniscate.run.state import TrainState, require_agreement
 from lemniscate.run.stopping import Stopped, StopRequest
 from lemniscate.run.updates import Watched, acted_with
@@ -159,12 +159,12 @@ class Run:
                 self._restart(state)
                 going_on = state.step < total_steps
                 while going_on:
-                    # Some LOOKS lines of a run have signals, of a short one a fourth: more would cost more than 1 %.
-                    every = max(4, math.ceil(total_steps * self._lines / (LOOKS * max(1, state.step))))
+                    # Some LOOKS lines of a run have signals, of a short one a fifth: more would cost more than 1 %.
+                    every = max(5, math.ceil(total_steps * self._lines / (LOOKS * max(1, state.step))))
                     looks = self.world.is_first and self._lines % every == 0
-                    before = (
-                        (acted_with(state), Watched(state, is_close(self._lines // every))) if looks else (None, None)
-                    )
+                    look = self._lines // every
+                    close = look if look < FIRST_CLOSE or look % EVERY_CLOSE == 0 else None
+                    before = (acted_with(state), Watched(state, close)) if looks else (None, None)
                     self._iteration = Iteration(state.step, self._episodes, *before)
                     yield self.env
                     if watched := self._iteration.watched:

@@ -1,6 +1,6 @@
 """Signals: measurements of a run's newest rows and of its networks, from which `lemniscate doctor` reads what is wrong.
 
-They are taken some twenty times in a run, and cost a hundredth of one of some seconds, less of longer ones. Nothing
+They are taken up to some twenty times in a run, and cost a hundredth of one of some seconds, less of longer ones. Nothing
 learns from them.
 """
 
@@ -23,9 +23,9 @@ from lemniscate.run.updates import Watched, of_batch, of_update, old_value_of, s
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 from lemniscate.types import Rollout, Transition
 
-LOOKS = 24
+LOOKS = 18
 """how often in a run the signals are measured"""
-FIRST_CLOSE, EVERY_CLOSE = 4, 6
+FIRST_CLOSE, EVERY_CLOSE = 3, 5
 """the looks in which gradients are taken apart: the first, before a policy collapses, and one of so many later"""
 KINDS = (
     *("reward/", "observation/", "action/", "value/", "advantage/"),
@@ -46,11 +46,6 @@ MOST_NUMBERS = 32
 """numbers of an observation up to which lines are fitted to them; for more there are too few rows"""
 UNITS = (*ACTIVATIONS.values(), nn.Tanh, nn.GELU, nn.LeakyReLU)
 """the modules whose outputs are hidden units; the last three are those of networks of one's own"""
-
-
-def is_close(look: int) -> bool:
-    """Whether the update of that look is looked at closely."""
-    return look < FIRST_CLOSE or look % EVERY_CLOSE == 0
 
 
 @torch.no_grad()
