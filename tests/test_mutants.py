@@ -1794,8 +1794,8 @@ MUTANTS = [
     (
         "lambda is the weight of the value",
         "run/updates.py",
-        "weights[3] / discount",
-        "weights[2] / discount",
+        "torch.tensor(chain / gamma)",
+        "torch.tensor(of_next / gamma)",
         "run/test_signals.py::test_targets_that_do_not_follow_show",
     ),
     (

@@ -109,6 +109,11 @@ def test_what_equations_show_is_named(case):
     assert name not in names(**{metric: [value] * 3 for metric, value in beside.items()})
 
 
+def test_play_at_random_that_never_ends_is_named():
+    assert "exploration-still" in names(algorithm="td3", action__off_mode=[0.8] * 8)
+    assert "exploration-still" not in names(algorithm="td3", action__off_mode=[0.8] * 4 + [0.1] * 4)
+
+
 def test_an_evaluation_with_another_time_limit_is_named():
     longer = {"evaluation__length": [100.0] * 8}
     assert "evaluated-otherwise" in names(lengths=[25] * 400, **longer)
@@ -139,12 +144,13 @@ CASES = {
         {"algorithm": "a2c", "losses__value": [2.0] * 8, "value__loss": [1.0] * 8},
     ),
     "rewards-differ": ({"targets__other_rewards": [0.1] * 2}, {"targets__other_rewards": [1e-12] * 2}),
+    "targets-rescaled": ({"targets__rescaled": [0.1] * 2}, {"targets__rescaled": [1e-12] * 2}),
     "targets-forward": ({"targets__forward": [1.0] * 2}, {"targets__forward": [0.0] * 2}),
     "critics-not-least": (
         {"algorithm": "sac", "gradient__if_other_critic": [1e-12] * 2},
         {"algorithm": "sac", "gradient__if_other_critic": [1e-3] * 2},
     ),
-    "clip-ignored": ({"gradient__if_no_clip": [1e-12] * 2}, {"gradient__if_no_clip": [1e-3] * 2}),
+    "clip-differs": ({"gradient__if_no_clip": [1e-12] * 2}, {"gradient__if_no_clip": [1e-3] * 2}),
     "rows-of-others": ({"gradient__other_rows": [0.5] * 3}, {"gradient__other_rows": [0.0] * 3}),
     "targets-copied": (
         {"algorithm": "td3", "targets__behind": [0.0] * 4, "targets__length": [1.0, 2.0, 3.0, 4.0]},

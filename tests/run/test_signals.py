@@ -972,15 +972,23 @@ MISTAKES = {
     ),
     "rewards less their mean": (
         lambda reward, *given: advantages(reward * 2 - 1, *given),
-        lambda found: min(found["targets/other_rewards"]) > 1e-3 and found["targets/discount"][0] == near(0.99),
+        lambda found: min(found["targets/other_rewards"]) > 1e-3 and "targets/trace" not in found,
     ),
     "another λ": (
         lambda *given: advantages(*given[:-1], 0.6),
-        lambda found: found["targets/trace"][0] == near(0.6) and found["targets/other_rewards"][0] < 1e-6,
+        lambda found: found["targets/trace"][0] == near(0.6) and "targets/other_rewards" not in found,
     ),
-    "another λ and γ": (
-        lambda *given: advantages(*given[:-2], 0.9, 0.5),
-        lambda found: found["targets/trace"][0] == near(0.5) and found["targets/discount"][0] == near(0.9),
+    "another γ": (
+        lambda *given: advantages(*given[:-2], 0.9, given[-1]),
+        lambda found: found["targets/discount"][0] == near(0.9) and "targets/trace" not in found,
+    ),
+    "advantages": (
+        lambda *given: (advantages(*given)[0],) * 2,
+        lambda found: set(found["targets/less_values"]) == {1.0} and "targets/forward" not in found,
+    ),
+    "standardized returns": (
+        lambda *given: (lambda a, target: (a, (target - 3) / 2))(*advantages(*given)),
+        lambda found: found["targets/rescaled"][0] == near(0.25) and "targets/other_rewards" not in found,
     ),
     "from the first row on": (lambda *given: forward(*given), lambda found: set(found["targets/forward"]) == {1.0}),
     "no baseline": (
@@ -1241,6 +1249,16 @@ KNOWN = {
         "critic_loss",
         lambda right: lambda c, s, *rest: right(c, Largest(s.networks, s.targets), *rest),
     ),
+    "advantage_target": (
+        "a2c",
+        "loss",
+        lambda right: lambda config, networks, batch: right(config, networks, replace(batch, target=batch.advantage)),
+    ),
+    "largest_clip": (
+        "ppo",
+        "clipped_surrogate",
+        lambda right: lambda log_ratio, advantage, clip: -right(log_ratio, -advantage, clip),
+    ),
     "no_clip": (
         "ppo",
         "clipped_surrogate",
@@ -1264,7 +1282,7 @@ def test_a_well_known_mistake_is_told_by_the_gradient_that_it_makes(mistake, tmp
     algorithm, name, wrong = KNOWN[mistake]
     module = algos.find(algorithm)
     monkeypatch.setattr(module, name, wrong(getattr(module, name)))
-    fields = {"clip": 1e-4} if mistake == "no_clip" else {}
+    fields = {"clip": 1e-4} if "clip" in mistake else {}
     found = looked_at(algorithm, tmp_path, **fields)
     assert found[f"gradient/if_{mistake}"].max() < 1e-9
     others = KNOWN.keys() - {mistake, "other_action"}  # of which one may be right by chance, where there are two
@@ -1286,6 +1304,31 @@ def test_the_discount_and_the_rewards_in_targets_of_q_are_told_by_the_gradient(
     assert found["targets/discount"] == near(discount)
     assert found["targets/other_rewards"] == pytest.approx(1.0 if times == 0.5 else 0.0, abs=1e-5)
     assert "targets/entropy" not in found
+
+
+@pytest.mark.parametrize(("algorithm", "name"), [("a2c", "value_loss"), ("ppo", "value_loss"), ("pqn", "value_loss")])
+def test_targets_that_are_standardized_are_told_by_the_gradient(algorithm, name, tmp_path, monkeypatch):
+    module = algos.find(algorithm)
+    right = getattr(module, name)
+    monkeypatch.setattr(module, name, lambda value, target, *rest: right(value, (target - target.mean()) / 3, *rest))
+    assert looked_at(algorithm, tmp_path)["targets/rescaled"].min() > 0.1
+
+
+def test_rows_that_an_update_takes_from_a_part_of_the_buffer_are_told(tmp_path, monkeypatch):
+    module = algos.find("ddpg")
+    right = module.update
+
+    def update(config, state):
+        learn, state.learn = state.learn, lambda c, s, replay, rows, **flags: learn(c, s, replay, rows % 20, **flags)
+        try:
+            return right(config, state)
+        finally:
+            state.learn = learn
+
+    monkeypatch.setattr(module, "update", update)
+    fields = {"total_steps": 1000, "learning_starts": 100, "log_every": 50, "progress": False}
+    lines = read_metrics(lem.train("ddpg", "Pendulum-v1", run=tmp_path / "run", **fields).path)
+    assert [line["replay/drawn"] for line in lines if "replay/drawn" in line][-1] < 0.1
 
 
 @pytest.mark.parametrize("times", [-1.0, 0.0])

@@ -69,7 +69,9 @@ class Rule:
 
 
 def _may_help(clause: str, config: Mapping[str, object]) -> bool:
-    options = [(field_of(option), value) for option, value in re.findall(r"(--[a-z-]+)(?: (off|none|0)\b)?", clause)]
+    options = [
+        (field_of(option), value) for option, value in re.findall(r"(--[a-z-]+)(?: (off|none|0)(?![\w.]))?", clause)
+    ]
     on_already = [repr(config.get(name)) == PRESENT[value] for name, value in options]
     return all(name in OF_COMMANDS or name in config for name, _ in options) and not (options and all(on_already))
 
@@ -92,7 +94,9 @@ CONSEQUENCES = {
         "observation-repeated",
         "setting-initial-log-std",
     },
-    "steps-short": {"observation-repeated", "exploding-observation"},
+    "steps-short": {"observation-repeated", "exploding-observation", "every-return-alike"},
+    "no-episode": {"ratio-always-one"},
+    "still-rising": {"fell-back"},
     "action-late": {"exploding-observation"},
     "reward-unexplained": {"exploding-observation"},
     "advantage-not-normalized": {"ratio-not-one", "loss-differs"},
@@ -113,9 +117,9 @@ CONSEQUENCES = {
     "gradient-clipped": {"loss-below-zero"},
     "missing-bootstrap": {"rate-zero", "rewards-differ", "targets-forward", "discount-differs"},
     "ends-ignored": {"ends-continued"},
-    "targets-differ": {"rewards-differ", "targets-forward", "discount-differs"},
-    "kl-too-large": {"clip-ignored"},
-    "ratios-clipped": {"clip-ignored"},
+    "targets-differ": {"rewards-differ", "targets-forward", "discount-differs", "targets-rescaled"},
+    "kl-too-large": {"clip-differs"},
+    "ratios-clipped": {"clip-differs"},
     "q-biased": {"critics-not-least"},
     "entropy-collapsed": {"entropy-opposed"},
     "ratio-not-one": {"rows-of-others"},
@@ -130,7 +134,9 @@ CONSEQUENCES = {
         "discount-differs",
         "entropy-opposed",
         "critics-not-least",
-        "clip-ignored",
+        "clip-differs",
+        "targets-rescaled",
+        "targets-differ",
     },
     "reward-small": {"setting-initial-log-std"},
 }
@@ -468,15 +474,6 @@ def of_exploration(e: Evidence) -> Seen:
                 "exploration-still",
                 f"epsilon went from {epsilon[0]:g} to {epsilon[-1]:g}; it is to end at {final:g}.",
             )
-    away, tried = e.late("action/off_mode"), e.values("action/off_mode")
-    never = len(tried) >= 3 and tried[:3].max() < 0.01 and not e.rose  # of a deterministic policy there is no more
-    if away < 0.25 and np.isfinite(e.late("losses/entropy")):
-        yield (
-            "acts-at-mode",
-            f"Actions lie {away:.2f} times as far from the policy's mode as those that are drawn from it.",
-        )
-    elif never:
-        yield "acts-at-mode", f"From the beginning on, actions lie within {tried[:3].max():.2g} of the policy's own."
     if late > max(3 * first, 2.0):
         yield (
             "std-exploded",
@@ -484,6 +481,25 @@ def of_exploration(e: Evidence) -> Seen:
         )
     if starts and total and starts > total / 2 and not e.as_recommended("learning_starts"):
         yield "mostly-random", f"The first {starts:,} of {total:,} steps are at random, without an update."
+
+
+def of_taken_actions(e: Evidence) -> Seen:
+    """Faults of how far the actions that are taken lie from those of the policy."""
+    away, tried = e.late("action/off_mode"), e.values("action/off_mode")
+    never = len(tried) >= 3 and tried[:3].max() < 0.01 and not e.rose  # of a deterministic policy there is no more
+    noise = first_number(e.config.get("noise_std"))
+    if noise is not None and away > max(0.5, 5 * noise) and len(tried) >= 5:
+        yield (
+            "exploration-still",
+            f"Actions lie {away:.2g} of half their range from the policy's own, and noise_std is {noise:g}.",
+        )
+    if away < 0.25 and np.isfinite(e.late("losses/entropy")):
+        yield (
+            "acts-at-mode",
+            f"Actions lie {away:.2f} times as far from the policy's mode as those that are drawn from it.",
+        )
+    elif never:
+        yield "acts-at-mode", f"From the beginning on, actions lie within {tried[:3].max():.2g} of the policy's own."
 
 
 def of_entropies(e: Evidence) -> Seen:
@@ -613,12 +629,17 @@ def of_parts_of_targets(e: Evidence) -> Seen:
     exact = not e.median("targets/unexplained") > OF_TARGETS or trace == trace
     if other > ROUNDING:
         yield "rewards-differ", f"In the targets there are other rewards than were paid: {other:.2g} of their squares."
-    if e.values("targets/forward").any():
+    if e.median("targets/less_values", 2) == 1:
+        yield "targets-differ", "The targets of V are advantages: V(s) is taken off."
+    if e.median("targets/forward", 2) == 1:
         yield "targets-forward", "Targets follow from the rows before them."
     if gamma is not None and exact and abs(discount - gamma) > max(1e-3, 0.1 * (1 - gamma)):
         yield "discount-differs", f"From row to row targets are discounted by {discount:.4g}, not by {gamma:g}."
     elif lam is not None and abs(trace - lam) > 0.01:
         yield "discount-differs", f"Targets are made with a λ of {trace:.3g}, not of {lam:g}."
+    if (rescaled := e.median("targets/rescaled", 2)) > ROUNDING:
+        said = f"The targets that are learned differ from those of the equations by {rescaled:.2g} of their squares"
+        yield "targets-rescaled", f"{said}, and are a y + b of them."
     if abs(entropy - 1) > 0.01:
         name = "entropy-opposed" if entropy < 0 else "loss-differs"
         yield name, f"In the targets of Q the entropy of the next action counts {entropy:.2g} times."
@@ -654,7 +675,9 @@ MISTAKES = {
     "other_action": ("rows-of-others", "is that of Q(s, ·) at other actions than were taken"),
     "other_rows": ("rows-of-others", "is that of an action, a reward, a target or a next observation of another row"),
     "other_critic": ("critics-not-least", "of Q is that of targets of the larger of two critics, their mean, or one"),
-    "no_clip": ("clip-ignored", "is that of ratios, or of values, that nothing clips"),
+    "advantage_target": ("targets-differ", "of V is that of advantages in the place of targets"),
+    "no_clip": ("clip-differs", "is that of ratios that nothing clips"),
+    "largest_clip": ("clip-differs", "is that of the larger of r A and clip(r) A, not of the smaller"),
 }
 """mistakes that `run/terms.py` tries where no term explains a gradient; each with its rule and what is seen"""
 
@@ -675,19 +698,26 @@ def of_gradients(e: Evidence) -> Seen:
     """Whether the terms of the equations' loss explain the gradients: a healthy run's to rounding."""
     rests = {part: e.median(f"gradient/{part}_rest", 2) for part in ("policy", "value")}
     weights = {part: e.median(f"gradient/{part}", 2) for part in rests}
+    judged = {"policy": "actions are", "value": "it is"}
     for part, whose in (("policy", "the policy"), ("value", "V or Q")):
         if rests[part] > ROUNDING:
-            share = f"{100 * rests[part]:.2g} % of the squares of the gradient of {whose}"
-            yield "loss-differs", f"No term of the loss explains {share}."
-        elif weights[part] == 0 and (part == "policy" or e.config.get("value_coef") != 0):
-            yield "loss-differs", f"The gradient of {whose} is 0, and that of the terms of the loss is not."
+            share = f"{100 * rests[part]:.2g} % of the squares of the gradient of {whose}, and rounding 1e-10 %"
+            yield "loss-differs", f"Training descends another loss: no term of the equations explains {share}."
+        elif abs(weights[part]) < ROUNDING and (part == "policy" or e.config.get("value_coef") != 0):
+            yield (
+                "loss-differs",
+                f"The gradient of {whose} has no part in which {judged[part]} judged.",
+            )
         elif weights[part] < 0:
             name = "advantage-opposed" if part == "policy" else "loss-differs"
             yield name, f"Training raises the loss of {whose} in place of lowering it."
             return
     if (later := e.median("gradient/later_rest", 1)) > ROUNDING:
         share = f"{100 * later:.2g} % of the squares of a gradient"
-        yield "loss-differs", f"Once the policy has moved, no term of the loss explains {share}: its clip, or its KL."
+        yield (
+            "loss-differs",
+            f"Once the policy has moved, no term of its loss explains {share}: look at its clip, or its KL.",
+        )
     entropy, coef = e.values("gradient/entropy"), first_number(e.config.get("value_coef"))
     times = weights["value"] / weights["policy"] if weights["policy"] > 0 else np.nan
     if coef and (times > FAR * coef or times < coef / FAR):
@@ -917,7 +947,8 @@ def of_returns(e: Evidence) -> Seen:
     if rise > 3 * error and rise > 0.05 * np.ptp(e.returns) and not arrived:
         yield (
             "still-rising",
-            f"Returns were still rising, from {before.mean():,.4g} to {last.mean():,.4g} in the last two fifths.",
+            f"Returns were still rising, from {before.mean():,.4g} to {last.mean():,.4g} in the last two fifths of the"
+            " episodes.",
         )
 
 
@@ -985,6 +1016,7 @@ SUBJECTS = (
     of_ratios,
     of_updates,
     of_exploration,
+    of_taken_actions,
     of_entropies,
     of_advantages,
     of_losses,

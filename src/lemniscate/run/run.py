@@ -160,7 +160,8 @@ class Run:
                 going_on = state.step < total_steps
                 while going_on:
                     # Some LOOKS lines of a run have signals, of a short one a fifth: more would cost more than 1 %.
-                    every = max(5, math.ceil(total_steps * self._lines / (LOOKS * max(1, state.step))))
+                    least = 1 if hasattr(state, "replay") else 5  # there lines are few, and each is of many steps
+                    every = max(least, math.ceil(total_steps * self._lines / (LOOKS * max(1, state.step))))
                     looks = self.world.is_first and self._lines % every == 0
                     look = self._lines // every
                     close = look if look < FIRST_CLOSE or look % EVERY_CLOSE == 0 else None

@@ -1,7 +1,7 @@
 """Signals: measurements of a run's newest rows and of its networks, from which `lemniscate doctor` reads what is wrong.
 
-They are taken up to some twenty times in a run, and cost a hundredth of one of some seconds, less of longer ones. Nothing
-learns from them.
+They are taken up to some twenty times in a run, and cost a hundredth of one of some seconds, less of longer ones.
+Nothing learns from them.
 """
 
 from collections.abc import Mapping
@@ -69,7 +69,7 @@ def signals(
     if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
         scaled = replace(rows, reward=state.reward_scale(rows.reward))
     found = of_networks(state, chosen) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
-    found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled))
+    found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled), watched)
     if watched:
         found |= of_batch(config, watched.given, scaled, old_value_of(state, acted)) | watched.found
     return of_environment(rows, spec, ages) | {name: float(value) for name, value in found.items()}
@@ -446,7 +446,7 @@ def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
     return found
 
 
-def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
+def of_critics(state: Any, config: RunConfig, rows: Rollout, watched: Watched | None = None) -> dict[str, Tensor]:
     """The mean squared error of Q over one step, of the newest rows and of sampled ones, and the share that is missing.
 
     For algorithms that learn Q(s, a) of continuous actions; those that have no replay sample the newest rows. Also what
@@ -464,7 +464,9 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
     critics, targets, share = None, None, torch.ones(())
     if replay is not None:
         drawn = replay.sample_indices(1, SEEN, generator)[0]
-        sampled, share = replay.transitions[drawn], (drawn.max() - drawn.min() + 1) / len(replay)
+        sampled, by_step = replay.transitions[drawn], watched.given[1] if watched else ()
+        taken = by_step[0] if by_step else drawn  # of the update itself, where that is known
+        share = (taken.max() - taken.min() + 1) / len(replay)
         critics, targets = networks.critics, getattr(state.targets, "critics", state.targets)
 
     def critic(*pair: Tensor) -> Tensor:

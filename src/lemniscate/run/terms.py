@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -145,6 +146,11 @@ def fitted(columns: Tensor, whole: Tensor) -> tuple[Tensor, Tensor]:
     return weights, (whole - columns @ weights).square().sum() / whole.square().sum()
 
 
+def difference(given: Tensor, right: Tensor) -> Tensor:
+    """The squares of what numbers [B] differ by from those that are right, as a share of their squares."""
+    return (given - right).square().mean() / given.square().mean().clamp(min=1e-12)
+
+
 class Online(NamedTuple):
     """A training state with other target networks, with a gradient through them or without one."""
 
@@ -165,10 +171,11 @@ def of_mistakes(
     - online_target, followed_target: y is of Q itself; and the gradient goes through it.
     - own_obs, own_action: y is of s in the place of s'; Q is of the policy's action in the place of the stored one.
     - other_critic: y is of the larger of two critics, of their mean or of one of them.
-    - no_clip: no ratio is clipped, and no value.
+    - advantage_target: V is to say the advantages.
+    - no_clip, largest_clip: no ratio is clipped, or the larger of r A and clip(r) A is taken.
     - not_zeroed: the gradient [P] is added to the one `before`, [P].
 
-    Also what `of_targets_of_q` finds.
+    Also what `of_targets` finds.
     """
     batch, *noise = args
     parts = of_gradient(config, state, optimizer, gradient, args)
@@ -184,8 +191,8 @@ def of_mistakes(
         ).min()
         for name, variants in left.items()
     }
-    if isinstance(batch, Transition) and isinstance(optimizer.networks, Critics):
-        found |= of_targets_of_q(config, state, optimizer, gradient, args)
+    if "gradient/value_rest" in parts:
+        found |= of_targets(config, state, optimizer, gradient, args)
     return found
 
 
@@ -193,11 +200,11 @@ def _mistaken(config: Any, state: Any, batch: Any) -> Iterator[tuple[str, Any, A
     """Names of mistakes, with the Config, the state and the rows of which they would be right."""
     if isinstance(batch, Transition):
         yield from ((name, config, its, rows) for name, its, rows in _mistaken_of_q(state, batch))
-    if getattr(config, "clip", None) or getattr(config, "clip_value", None):
-        loose = {
-            name: None if name == "clip_value" else 1e9 for name in ("clip", "clip_value") if hasattr(config, name)
-        }
-        yield "no_clip", replace(config, **loose), state, batch
+    if isinstance(batch, DrawnBatch) and hasattr(config, "clip"):
+        yield "no_clip", replace(config, clip=1e9), state, batch
+        yield "largest_clip", config, state, replace(batch, advantage=-batch.advantage)
+    if isinstance(batch, Batch):
+        yield "advantage_target", config, state, replace(batch, target=batch.advantage)
     if isinstance(batch, Batch | QBatch):
         yield "mean_target", config, state, replace(batch, target=batch.target.mean().expand_as(batch.target))
     if type(batch) is QBatch:
@@ -238,32 +245,48 @@ class Judged(NamedTuple):
         return self.judge(self.critics(obs, action))[None]
 
 
-def of_targets_of_q(
-    config: Any, state: Any, optimizer: Adam, gradient: Tensor, args: tuple[Any, ...]
-) -> dict[str, Tensor]:
-    """Of which numbers the targets of Q(s, a) are made, by the gradient [P] that they make; nothing where of others.
+def of_targets(config: Any, state: Any, optimizer: Adam, gradient: Tensor, args: tuple[Any, ...]) -> dict[str, Tensor]:
+    """Of which numbers the targets of V or Q are made, by the gradient [P] that they make; nothing where of others.
 
-    - targets/discount: γ.
-    - targets/other_rewards: as of `of_recursion`.
-    - targets/entropy: how often the entropy of the next action counts.
+    - targets/other_rewards, targets/discount: as of `updates.of_recursion`, of Q(s, a) of continuous actions.
+    - targets/entropy: how often the entropy of the next action counts there.
+    - targets/rescaled: the difference of a y + b, which stands there for y, from y, as a share of its squares; of V and
+      of Q(s, ·).
     """
     batch, *noise = args
+    networks: Any = optimizer.networks
+    of_q = isinstance(batch, Transition)
     with torch.no_grad():
-        next_value, bonus = _next_of_q(config, state, batch, *noise)
-        ahead = ~batch.terminated * config.gamma
+        next_value, bonus = _next_of_q(config, state, batch, *noise) if of_q else (torch.zeros(1), torch.zeros(1))
+        wanted, ahead = (batch.reward, ~batch.terminated * config.gamma) if of_q else (batch.target, torch.zeros(1))
     with torch.enable_grad():
-        q = optimizer.networks(batch.obs, batch.action)
-        parts = [q.detach(), -batch.reward, -torch.ones_like(batch.reward), -ahead * next_value, -ahead * bonus]
-        slopes = [
-            torch.autograd.grad((part * q).mean(-1).sum(), optimizer.parameters, retain_graph=True) for part in parts
+        if of_q:
+            said = networks(batch.obs, batch.action)
+        elif isinstance(batch, QBatch):
+            said = networks.q(batch.obs, batch.action)
+        else:
+            said = networks(batch.obs)[1] if isinstance(networks, ActorCritic) else networks(batch.obs)
+        parts = [
+            said.detach(),
+            -wanted,
+            -torch.ones_like(wanted),
+            *((-ahead * next_value, -ahead * bonus) if of_q else ()),
         ]
+        grad = partial(torch.autograd.grad, inputs=optimizer.parameters, retain_graph=True, materialize_grads=True)
+        slopes = [grad((part * said).mean(-1).sum(), allow_unused=True) for part in parts]
     columns = torch.stack([torch.cat([each.flatten() for each in slope]) for slope in slopes], 1).cpu().double()
-    weights, rest = fitted(columns, gradient.cpu().double())
+    moved = columns.any(1)
+    weights, rest = fitted(columns[moved], gradient.cpu().double()[moved])
     if rest > ROUNDING:
         return {}
-    a, b, of_next, of_bonus = weights[1:] / weights[0]
-    reward = batch.reward.cpu().double()
-    rewards = a * reward + b
-    differ = (rewards - reward).square().mean() / rewards.square().mean().clamp(min=1e-12)
-    found = {"targets/discount": config.gamma * of_next, "targets/other_rewards": differ}
-    return found | ({"targets/entropy": of_bonus / of_next} if bonus.any() else {})
+    a, b, *others = (weights[1:] / weights[0]).tolist()
+    wanted = wanted.cpu().double()
+    other = difference(a * wanted + b, wanted)
+    if not of_q:
+        return {"targets/rescaled": other}
+    if abs(a) < 1e-3 and abs(others[0]) < 1e-3:  # a number for all rows
+        return {"gradient/if_mean_target": rest}
+    if min(abs(a - 1), abs(others[0] - 1)) > 1e-2:  # two things at once, or a fit that says nothing
+        return {}
+    found = {"targets/discount": torch.tensor(config.gamma * others[0]), "targets/other_rewards": other}
+    return found | ({"targets/entropy": torch.tensor(others[1] / others[0])} if bonus.any() else {})

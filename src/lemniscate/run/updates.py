@@ -21,7 +21,7 @@ from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, LossFunction
 from lemniscate.optim.compiled import Learner
 from lemniscate.run.config import RunConfig
-from lemniscate.run.terms import ROUNDING, fitted, of_gradient, of_mistakes
+from lemniscate.run.terms import ROUNDING, difference, fitted, of_gradient, of_mistakes
 from lemniscate.types import Batch, DrawnBatch, Metrics, Rollout, wide_float
 
 Given = tuple[Any, tuple[Tensor, ...], bool]
@@ -238,10 +238,12 @@ def of_recursion(config: RunConfig, rows: Rollout, value: Tensor, target: Tensor
     - targets/discount: the factor by which they follow from those, which λ mixes.
     - targets/unexplained: the share of their squares that does not follow so.
 
-    Where that is more than rounding, whether they are made of other shares of these numbers:
+    Where that is more than rounding, what explains it, if one thing alone does:
 
-    - targets/trace: λ, and targets/discount is that of these shares.
+    - targets/trace: another λ, and targets/discount is γ.
     - targets/other_rewards: the difference of a r + b, which stands there for r, from r, as a share of its squares.
+    - targets/rescaled: the share that is left of a y in the place of the targets y, (1 − a)².
+    - targets/less_values: 1 where they are advantages, without the values.
     - targets/forward: 1 where they are made of the row before in the place of the row after.
     """
     on = ~rows.done[:-1] & rows.valid[:-1] & rows.valid[1:]
@@ -255,17 +257,25 @@ def of_recursion(config: RunConfig, rows: Rollout, value: Tensor, target: Tensor
     if found["targets/unexplained"] <= OF_TARGETS:
         return found
     v, g, r, on = (x.cpu().double() for x in (value, target, rows.reward, on))
-    one, on = torch.ones_like(g), on.bool()
-    weights, left = fitted(torch.stack([x[on] for x in (r[:-1], one[1:], v[1:], g[1:])], 1), g[:-1][on])
+    one, on, gamma = torch.ones_like(g), on.bool(), getattr(config, "gamma", 1.0)
+    after = [r[:-1], one[1:], v[:-1], v[1:], g[1:]]
+    weights, left = fitted(torch.stack([x[on] for x in after], 1), g[:-1][on])
     if left < OF_TARGETS / 10:
-        reward, discount = weights[0] * r[:-1][on] + weights[1], weights[2] + weights[3]
-        differ = (reward - r[:-1][on]).square().mean() / reward.square().mean().clamp(min=1e-12)
-        own = {"targets/discount": discount, "targets/trace": weights[3] / discount, "targets/other_rewards": differ}
-        return found | own
+        a, b, own, of_next, chain = weights.tolist()
+        right = [abs(x - y) < 1e-3 for x, y in ((of_next, gamma * (1 - lam)), (chain, gamma * lam))]
+        if abs(own + 1) < 1e-3:
+            return found | {"targets/less_values": torch.ones(())}
+        if all(right):
+            return found | {"targets/other_rewards": difference(a * r[:-1][on] + b, r[:-1][on])}
+        if abs(of_next + chain - gamma) < 1e-3:
+            return found | {"targets/discount": torch.tensor(gamma), "targets/trace": torch.tensor(chain / gamma)}
+        times = of_next / (gamma * (1 - lam)) if lam < 1 else 1.0
+        return found | ({"targets/rescaled": torch.tensor((1 - times) ** 2)} if right[1] else {})
     both = on[:-1] & on[1:]  # A = δ + γ λ of the row before
-    before = r[1:-1], one[1:-1], v[1:-1], v[2:], g[:-2], v[:-2]
-    left = fitted(torch.stack([x[both] for x in before], 1), g[1:-1][both])[1]
-    return found | ({"targets/forward": torch.ones(())} if left < OF_TARGETS / 10 else {})
+    before = r[1:-1], one[1:-1], v[1:-1], v[2:], v[:-2], g[:-2]
+    weights, left = fitted(torch.stack([x[both] for x in before], 1), g[1:-1][both])
+    forward = left < OF_TARGETS / 10 and 0 < weights[-1] <= 1  # above 1 it is the other way round, solved for this row
+    return found | ({"targets/forward": torch.ones(())} if forward else {})
 
 
 def of_cuts(
