@@ -109,11 +109,6 @@ def test_what_equations_show_is_named(case):
     assert name not in names(**{metric: [value] * 3 for metric, value in beside.items()})
 
 
-def test_play_at_random_that_never_ends_is_named():
-    assert "exploration-still" in names(algorithm="td3", action__off_mode=[0.8] * 8)
-    assert "exploration-still" not in names(algorithm="td3", action__off_mode=[0.8] * 4 + [0.1] * 4)
-
-
 def test_an_evaluation_with_another_time_limit_is_named():
     longer = {"evaluation__length": [100.0] * 8}
     assert "evaluated-otherwise" in names(lengths=[25] * 400, **longer)

@@ -487,12 +487,6 @@ def of_taken_actions(e: Evidence) -> Seen:
     """Faults of how far the actions that are taken lie from those of the policy."""
     away, tried = e.late("action/off_mode"), e.values("action/off_mode")
     never = len(tried) >= 3 and tried[:3].max() < 0.01 and not e.rose  # of a deterministic policy there is no more
-    noise = first_number(e.config.get("noise_std"))
-    if noise is not None and away > max(0.5, 5 * noise) and len(tried) >= 5:
-        yield (
-            "exploration-still",
-            f"Actions lie {away:.2g} of half their range from the policy's own, and noise_std is {noise:g}.",
-        )
     if away < 0.25 and np.isfinite(e.late("losses/entropy")):
         yield (
             "acts-at-mode",
