@@ -1642,7 +1642,7 @@ MUTANTS = [
         "run/run.py",
         "self.world.is_first and self._lines % every == 0",
         "self.world.is_first",
-        "run/test_signals.py::test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line",
+        "run/test_signals.py::test_there_are_signals_in_a_known_number_of_lines_of_a_run_and_in_its_first",
     ),
     (
         "consequences stand beside their cause",

@@ -462,7 +462,7 @@ def test_a_normalizer_that_is_behind_shows_its_offset():
     assert found["normalizer/count"] == B
 
 
-def test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line(tmp_path):
+def test_there_are_signals_in_a_known_number_of_lines_of_a_run_and_in_its_first(tmp_path):
     fields = tiny_fields(total_steps=32 * 200)
     run = lem.train("ppo", "Countdown-v0", run=tmp_path / "r", progress=False, **fields)
     lines = read_metrics(run.path)
@@ -1314,21 +1314,25 @@ def test_targets_that_are_standardized_are_told_by_the_gradient(algorithm, name,
     assert looked_at(algorithm, tmp_path)["targets/rescaled"].min() > 0.1
 
 
-def test_rows_that_an_update_takes_from_a_part_of_the_buffer_are_told(tmp_path, monkeypatch):
+@pytest.mark.parametrize("part", [20, 10_000])
+def test_rows_that_an_update_takes_from_a_part_of_the_buffer_are_told(part, tmp_path, monkeypatch):
+    """The buffer grows to twice its length after the first update of a line."""
     module = algos.find("ddpg")
     right = module.update
 
     def update(config, state):
-        learn, state.learn = state.learn, lambda c, s, replay, rows, **flags: learn(c, s, replay, rows % 20, **flags)
+        learn, state.learn = state.learn, lambda c, s, replay, rows, **flags: learn(c, s, replay, rows % part, **flags)
         try:
             return right(config, state)
         finally:
             state.learn = learn
 
     monkeypatch.setattr(module, "update", update)
-    fields = {"total_steps": 1000, "learning_starts": 100, "log_every": 50, "progress": False}
+    fields = {"total_steps": 1000, "learning_starts": 250, "log_every": 250, "progress": False}
     lines = read_metrics(lem.train("ddpg", "Pendulum-v1", run=tmp_path / "run", **fields).path)
-    assert [line["replay/drawn"] for line in lines if "replay/drawn" in line][-1] < 0.1
+    shares = [line["replay/drawn"] for line in lines if "replay/drawn" in line]
+    assert len(shares) == 3
+    assert max(shares) < 0.1 if part == 20 else min(shares) > 0.9
 
 
 @pytest.mark.parametrize("times", [-1.0, 0.0])

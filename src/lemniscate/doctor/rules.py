@@ -615,14 +615,15 @@ def of_batches(e: Evidence) -> Seen:
 
 
 def of_parts_of_targets(e: Evidence) -> Seen:
-    """Of which numbers the targets of V or Q are made: rewards, γ, λ and entropies, to rounding."""
+    """Faults of the rewards, γ, λ and entropies in the targets of V or Q, which are known to rounding."""
     names = ("discount", "trace", "other_rewards", "entropy")
     discount, trace, other, entropy = (e.median(f"targets/{name}", 2) for name in names)
     gamma, lam = (first_number(e.config.get(name)) for name in ("gamma", "gae_lambda"))
     lam = first_number(e.config.get("td_lambda")) if lam is None else lam
     exact = not e.median("targets/unexplained") > OF_TARGETS or trace == trace
     if other > ROUNDING:
-        yield "rewards-differ", f"In the targets there are other rewards than were paid: {other:.2g} of their squares."
+        either = ", or returns are standardized" if lam == 1 or "returns" in e.config else ""  # then it is the same
+        yield "rewards-differ", f"The rewards in the targets differ from those paid, by {other:.2g} of squares{either}."
     if e.median("targets/less_values", 2) == 1:
         yield "targets-differ", "The targets of V are advantages: V(s) is taken off."
     if e.median("targets/forward", 2) == 1:
@@ -632,8 +633,8 @@ def of_parts_of_targets(e: Evidence) -> Seen:
     elif lam is not None and abs(trace - lam) > 0.01:
         yield "discount-differs", f"Targets are made with a λ of {trace:.3g}, not of {lam:g}."
     if (rescaled := e.median("targets/rescaled", 2)) > ROUNDING:
-        said = f"The targets that are learned differ from those of the equations by {rescaled:.2g} of their squares"
-        yield "targets-rescaled", f"{said}, and are a y + b of them."
+        said = "The targets that are learned are a y + b, where y are those of the equations"
+        yield "targets-rescaled", f"{said}: they differ by {rescaled:.2g} of their squares."
     if abs(entropy - 1) > 0.01:
         name = "entropy-opposed" if entropy < 0 else "loss-differs"
         yield name, f"In the targets of Q the entropy of the next action counts {entropy:.2g} times."

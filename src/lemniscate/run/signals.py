@@ -465,8 +465,8 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout, watched: Watched | 
     if replay is not None:
         drawn = replay.sample_indices(1, SEEN, generator)[0]
         sampled, by_step = replay.transitions[drawn], watched.given[1] if watched else ()
-        taken = by_step[0] if by_step else drawn  # of the update itself, where that is known
-        share = (taken.max() - taken.min() + 1) / len(replay)
+        taken, stored = (by_step[0], watched.stored) if watched and by_step else (drawn, len(replay))
+        share = (taken.max() - taken.min() + 1) / stored
         critics, targets = networks.critics, getattr(state.targets, "critics", state.targets)
 
     def critic(*pair: Tensor) -> Tensor:

@@ -246,7 +246,7 @@ class Judged(NamedTuple):
 
 
 def of_targets(config: Any, state: Any, optimizer: Adam, gradient: Tensor, args: tuple[Any, ...]) -> dict[str, Tensor]:
-    """Of which numbers the targets of V or Q are made, by the gradient [P] that they make; nothing where of others.
+    """What differs in the targets of V or Q, by the gradient [P] that they make, where that is one thing alone.
 
     - targets/other_rewards, targets/discount: as of `updates.of_recursion`, of Q(s, a) of continuous actions.
     - targets/entropy: how often the entropy of the next action counts there.

@@ -43,9 +43,9 @@ def acted_with(state: Any) -> dict[str, Tensor]:
 class Watched:
     """The gradient steps of an algorithm, in an update that is looked at: what the first call was given is kept.
 
-    In the close look of a number, `found` has the signals of the first gradient of each optimizer: `of_gradient`. In
-    each second one it is the first of the second call, where the policy is no more the one that acted; else of a loss
-    that keeps the policy near that one, no look would show how.
+    In a close look, which has a number, `found` has the signals of the first gradient of each optimizer: `of_gradient`.
+    In every second one it is the first gradient of the second call: before the policy has moved, neither a clip nor a
+    bound on the KL divergence does anything.
     """
 
     def __init__(self, state: Any, close: int | None = None) -> None:
@@ -54,6 +54,8 @@ class Watched:
         self._now: tuple[Any, ...] = ()
         self._unseen = [] if close is None else [each for each in state.optimizers() if not each.over_shards]
         self.found: dict[str, Tensor] = {}
+        self.stored = 0
+        """rows of the replay buffer, if there is one, at the first call"""
         state.learn = self
 
     def __call__(self, *args: Any, **flags: Any) -> Any:
@@ -62,6 +64,7 @@ class Watched:
         data, *by_step = args[2:] or (None,)
         if not self._given and len(args) > 2:
             self._given = self._with_values(data) if type(data) is QBatch else data, *by_step
+            self.stored = len(self._state.replay) if hasattr(self._state, "replay") else 0
         if not self._unseen or self._calls > MOST_CALLS or (self._calls == 1 and self._is_later(data)):
             return self._learn(*args, **flags)
         self._now, watched = args, [*self._unseen]
@@ -260,6 +263,8 @@ def of_recursion(config: RunConfig, rows: Rollout, value: Tensor, target: Tensor
     one, on, gamma = torch.ones_like(g), on.bool(), getattr(config, "gamma", 1.0)
     after = [r[:-1], one[1:], v[:-1], v[1:], g[1:]]
     weights, left = fitted(torch.stack([x[on] for x in after], 1), g[:-1][on])
+    if v[1:][on].std() < 1e-3 * g[1:][on].std():  # then no fit knows what V counts
+        return found
     if left < OF_TARGETS / 10:
         a, b, own, of_next, chain = weights.tolist()
         right = [abs(x - y) < 1e-3 for x, y in ((of_next, gamma * (1 - lam)), (chain, gamma * lam))]
