@@ -114,7 +114,9 @@ FAULTS: dict[str, tuple[str, Mapping[str, int], Mapping[str, Any], tuple[str, ..
     ),
     "replay ratio too low": ("sac", OFF, QUICK | {"update_every": 20}, ("setting-replay-ratio",)),
     "replay buffer too small": ("sac", OFF, QUICK | {"buffer_size": 300}, ("setting-buffer-size",)),
-    "mostly at random": ("sac", OFF, QUICK | {"learning_starts": 2_900}, ("mostly-random",)),
+    "mostly at random": (
+        "sac", OFF, QUICK | {"learning_starts": 2_900, "total_steps": 3_000}, ("mostly-random",)
+    ),
     "temperature too high": ("sac", OFF, QUICK | {"initial_temperature": 100.0}, ("setting-initial-temperature",)),
     "entropy asked for too high": ("sac", OFF, QUICK | {"target_entropy": 5.0}, ("entropy-unreachable",)),
     "critic's rate too high": (
@@ -244,6 +246,11 @@ LEARNERS = faulty.LEARNERS | {name: lambda _, change=change: change() for name, 
 BY_OPTIONS = {"large-observation", "reward-large", "reward-small", "advantage-not-normalized", "mostly-random",
               "entropy-unreachable"}  # fmt: skip
 """findings whose remedy is an option"""
+CURED_IN = {
+    "ppo": {"CartPole-v1": 50_000, "InvertedPendulum-v5": 100_000, "HalfCheetah-v5": 200_000},
+    "sac": {"Pendulum-v1": 6_000, "InvertedPendulum-v5": 6_000},
+}
+"""environments in which a remedy is tried, with the steps of a run; a fault may have its own"""
 
 HEALTHY = ("CartPole-v1", "Acrobot-v1", "LunarLander-v3", "Pendulum-v1", "MountainCarContinuous-v0", "HalfCheetah-v5",
            "Hopper-v5", "Walker2d-v5", "Ant-v5", "Swimmer-v5", "InvertedPendulum-v5", "Reacher-v5",
@@ -335,15 +342,18 @@ def remedied(algorithm: str, env: str, fields: Mapping[str, Any], remedy: str) -
 
 def cured(name: str, env: str, seed: int, folder: Path) -> list[float]:
     """Mean returns of the final policies: with the fault, with the first finding's remedy, and without the fault."""
-    algorithm, steps, change, _ = FAULTS[name]
-    healthy = {"total_steps": steps[env], **(QUICK if algorithm == "sac" else {})}
+    algorithm, _, change, _ = FAULTS[name]
+    total = change.get("total_steps", CURED_IN[algorithm][env])
+    healthy = {"total_steps": total, **(QUICK if algorithm == "sac" else {})}
     path = folder / f"{name}-{env}-{seed}".replace(" ", "_")
     fields = {**healthy, **change}
     with_fault = trained_return(path, algorithm, env, seed, fields)
-    first = next(one for one in lem.diagnose(path) if one.sure != "hint")
-    fields = remedied(algorithm, env, fields, first.remedy)
+    first = next((one.remedy for one in lem.diagnose(path) if one.sure != "hint"), "")
+    fields = remedied(algorithm, env, fields, first)
+    without = trained_return(folder / f"{algorithm}-{env}-{seed}-{total}", algorithm, env, seed, healthy)
+    if lem.config_for(algorithm, env, "default", **fields) == lem.config_for(algorithm, env, "default", **healthy):
+        return [with_fault, without, without]  # the same run, to the bit
     with_remedy = trained_return(path.with_name(path.name + "-remedy"), algorithm, env, seed, fields)
-    without = trained_return(folder / f"{algorithm}-{env}-{seed}", algorithm, env, seed, healthy)
     return [with_fault, with_remedy, without]
 
 
@@ -365,7 +375,7 @@ def cost() -> None:
         return of
 
     loop.signals, loop.acted_with = timed(loop.signals), timed(loop.acted_with)
-    for name in ("of_minibatch", "of_old_policy", "of_gradient", "of_mistakes"):
+    for name in ("minibatch_signals", "old_policy_signals", "gradient_signals", "mistake_signals"):
         setattr(updates, name, timed(getattr(updates, name)))
     for algorithm, env, steps in (
         ("ppo", "CartPole-v1", 50_000),
@@ -407,10 +417,11 @@ def table(half: str | None) -> None:
     }
     alarms = {key: found for key, found in fine.items() if found}
     print(f"false alarms: {len(alarms)} of {len(fine)}", alarms)
-    for name, env, seed, returns in {
-        (row["remedy"], row["env"], row["seed"], tuple(row["returns"])) for row in rows("doctor") if "remedy" in row
-    }:
-        print(f"| {name} | {env} | {seed} | {' | '.join(f'{value:,.0f}' for value in returns)} |")
+    cures = {(row["remedy"], row["env"], row["seed"]): row["returns"] for row in rows("doctor") if "remedy" in row}
+    for name, env in dict.fromkeys(key[:2] for key in cures):
+        each = [returns for key, returns in cures.items() if key[:2] == (name, env)]
+        means = (f"{sum(column) / len(each):,.1f}" for column in zip(*each, strict=True))
+        print(f"| {name} | {env} | {len(each)} | {' | '.join(means)} |")
 
 
 if __name__ == "__main__":
@@ -453,7 +464,7 @@ if __name__ == "__main__":
                 append("doctor", row | provenance())
                 print("✗" if found else "✓", algorithm, env, preset, found, flush=True)
         for name in (given.only or filter(curable, FAULTS)) if given.what == "remedies" else ():
-            for env in FAULTS[name][1]:
+            for env in [env for env in CURED_IN[FAULTS[name][0]] if env in {**FAULTS[name][1], **BOX}]:
                 for seed in given.seeds:
                     returns = cured(name, env, seed, folder)
                     row = {"remedy": name, "env": env, "seed": seed, "returns": returns}

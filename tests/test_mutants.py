@@ -752,7 +752,7 @@ MUTANTS = [
         "the maximum is of the action taken",
         "nn/actor_critic.py",
         "values.amax(-1), obs, next_obs)",
-        "_taken(values, action), obs, next_obs)",
+        "_values_taken(values, action), obs, next_obs)",
         PQN + "the_target_is_the_return_of_the_best_next_action",
     ),
     (
@@ -1795,7 +1795,7 @@ MUTANTS = [
         "lambda is the weight of the value",
         "run/updates.py",
         "torch.tensor(chain / gamma)",
-        "torch.tensor(of_next / gamma)",
+        "torch.tensor(next_weight / gamma)",
         "run/test_signals.py::test_targets_that_do_not_follow_show",
     ),
     (

@@ -28,21 +28,21 @@ from lemniscate.run.metrics import read_metrics
 from lemniscate.run.signals import (
     KINDS,
     LOOKS,
+    critic_signals,
     effect_beside,
+    effect_signals,
+    environment_signals,
     late_effect,
-    of_critics,
-    of_effects,
-    of_environment,
-    of_networks,
-    of_replay,
-    of_rows,
-    of_starts,
-    of_time,
-    of_values,
+    network_signals,
     paid_before,
+    replay_signals,
+    row_signals,
     signals,
+    start_signals,
+    time_signals,
+    value_signals,
 )
-from lemniscate.run.updates import Watched, acted_with, of_batch, of_update
+from lemniscate.run.updates import Watched, acted_with, batch_signals, update_signals
 from lemniscate.spec import Box, Discrete, MultiDiscrete, ObservationPart, Spec
 from lemniscate.types import Batch, Rollout, Step, Transition
 
@@ -124,7 +124,7 @@ def delayed(late, ends=False):
 def test_an_action_that_is_late_is_found(late):
     rows = delayed(late)
     assert late_effect(rows, spec_of()).item() > 0.9
-    assert of_effects(rows[rows.valid], spec_of())["action/effect"].item() < 0.1
+    assert effect_signals(rows[rows.valid], spec_of())["action/effect"].item() < 0.1
     assert late_effect(delayed(0), spec_of()).item() < 0.1
 
 
@@ -160,16 +160,16 @@ def test_rewards_of_nothing_and_observations_that_repeat_are_counted():
     obs = numbers(B, O).float()
     after = torch.where(torch.arange(B)[:, None] % 4 == 0, obs, obs + 1)
     reward = (torch.arange(B) % 10 == 0).float()
-    found = of_rows(rows(obs=obs, next_obs=after, reward=reward), spec_of())
+    found = row_signals(rows(obs=obs, next_obs=after, reward=reward), spec_of())
     assert found["reward/zero"].item() == pytest.approx(0.9)
     assert found["observation/repeated"].item() == pytest.approx(0.25)
-    assert "observation/repeated" not in of_rows(rows(obs=(obs > 0).float()), spec_of())
+    assert "observation/repeated" not in row_signals(rows(obs=(obs > 0).float()), spec_of())
 
 
 def test_an_observation_of_noise_says_nothing_of_the_next():
     obs = numbers(B, O).float()
-    still = of_effects(rows(obs=obs, next_obs=obs + 0.1 * numbers(B, O, seed=5).float()), spec_of())
-    noise = of_effects(rows(), spec_of())
+    still = effect_signals(rows(obs=obs, next_obs=obs + 0.1 * numbers(B, O, seed=5).float()), spec_of())
+    noise = effect_signals(rows(), spec_of())
     assert still["observation/predicted"].item() > 0.95
     assert abs(noise["observation/predicted"].item()) < 0.05
 
@@ -178,7 +178,7 @@ def test_a_weak_action_has_a_small_share_of_the_change():
     obs, action = numbers(B, O), numbers(B, A, seed=1)
     after = 0.5 * obs
     after[:, :A] += 0.01 * action
-    found = of_effects(rows(obs=obs.float(), action=action.float(), next_obs=after.float()), spec_of())
+    found = effect_signals(rows(obs=obs.float(), action=action.float(), next_obs=after.float()), spec_of())
     assert found["action/effect"].item() > 0.99
     assert found["action/share"].item() == pytest.approx((0.01 / 0.5) ** 2, rel=0.3)
 
@@ -190,10 +190,12 @@ def test_rewards_that_tell_the_time_do_so_within_each_episode():
     age = torch.arange(steps) % 10
     reward = (age[:, None] + 100.0 * torch.arange(envs)).float()  # another level in each environment
     shape = {"terminated": done, "truncated": ~done & done, "valid": torch.ones_like(done), "reward": reward}
-    assert of_time(SimpleNamespace(done=done, **shape))["reward/by_time"].item() == pytest.approx(1)
+    assert time_signals(SimpleNamespace(done=done, **shape))["reward/by_time"].item() == pytest.approx(1)
     noise = numbers(steps, envs).float()
-    assert of_time(SimpleNamespace(done=done, **{**shape, "reward": noise}))["reward/by_time"].item() < 0.1
-    assert of_time(SimpleNamespace(done=done, **{**shape, "reward": torch.ones_like(reward)}))["reward/by_time"] == 0
+    assert time_signals(SimpleNamespace(done=done, **{**shape, "reward": noise}))["reward/by_time"].item() < 0.1
+    assert (
+        time_signals(SimpleNamespace(done=done, **{**shape, "reward": torch.ones_like(reward)}))["reward/by_time"] == 0
+    )
 
 
 def aged(steps, ages):
@@ -212,21 +214,21 @@ def test_rewards_that_grow_with_the_age_of_an_episode_are_explained_by_it_alone(
     ages = torch.tensor([50.0, 400.0, 800.0, 990.0])
     rows, age = aged(40, ages)
     grown = replace(rows, reward=rows.reward + 0.05 * age)
-    found, noise = (of_environment(each, spec_of(), ages)["reward/by_age"] for each in (grown, rows))
+    found, noise = (environment_signals(each, spec_of(), ages)["reward/by_age"] for each in (grown, rows))
     assert found > 0.9
     assert noise < 0.1
     seen = replace(grown, obs=torch.cat([age[..., None].float(), rows.obs[..., 1:]], -1))  # an observation tells it
-    assert "reward/by_age" not in of_environment(seen, spec_of(), ages)
-    assert "reward/by_age" not in of_environment(grown, spec_of())
+    assert "reward/by_age" not in environment_signals(seen, spec_of(), ages)
+    assert "reward/by_age" not in environment_signals(grown, spec_of())
 
 
 def test_the_age_at_which_rare_rewards_are_paid_is_a_share_of_that_of_all_rows():
     ages = torch.tensor([80.0, 80.0, 80.0])
     rows, age = aged(80, ages)
     early, late = ((replace(rows, reward=(at).float())) for at in (age < 4, age >= 76))
-    assert of_environment(early, spec_of(), ages)["reward/age"] == pytest.approx(2.5 / 40.5)
-    assert of_environment(late, spec_of(), ages)["reward/age"] == pytest.approx(78.5 / 40.5)
-    assert "reward/age" not in of_environment(rows, spec_of(), ages)
+    assert environment_signals(early, spec_of(), ages)["reward/age"] == pytest.approx(2.5 / 40.5)
+    assert environment_signals(late, spec_of(), ages)["reward/age"] == pytest.approx(78.5 / 40.5)
+    assert "reward/age" not in environment_signals(rows, spec_of(), ages)
 
 
 def test_observations_that_jump_at_the_same_ages_are_of_ends_that_nobody_reports():
@@ -237,7 +239,7 @@ def test_observations_that_jump_at_the_same_ages_are_of_ends_that_nobody_reports
     def moved(at):
         place = places.gather(0, at.cumsum(0)[..., None].expand_as(places))  # another one from each of these steps on
         obs = torch.cat([places[:1], place[:-1]]) + 0.01 * rows.obs
-        return of_environment(replace(rows, obs=obs, next_obs=place), spec_of(), ages)
+        return environment_signals(replace(rows, obs=obs, next_obs=place), spec_of(), ages)
 
     every = moved((age + 1) % 25 == 0)
     assert every["observation/jumps_every"] == 25
@@ -254,13 +256,13 @@ def test_the_variance_of_rewards_within_episodes_is_what_their_means_leave():
 
     def within(reward):
         shape = {"terminated": done, "truncated": ~done & done, "valid": torch.ones_like(done)}
-        return of_time(SimpleNamespace(done=done, reward=reward.float(), **shape))["reward/within"].item()
+        return time_signals(SimpleNamespace(done=done, reward=reward.float(), **shape))["reward/within"].item()
 
     episodes = (level + noise).view(4, 10, envs)
     expected = (episodes - episodes.mean(1, keepdim=True)).square().mean() / (level + noise).var(correction=0)
     assert within(level) == pytest.approx(0, abs=1e-9)
     each = {"terminated": ~(done & ~done), "truncated": done & ~done, "valid": torch.ones_like(done)}
-    assert "reward/within" not in of_time(SimpleNamespace(done=each["terminated"], reward=noise.float(), **each))
+    assert "reward/within" not in time_signals(SimpleNamespace(done=each["terminated"], reward=noise.float(), **each))
     assert within(level + noise) == pytest.approx(expected.item(), rel=1e-4)
 
 
@@ -273,7 +275,7 @@ def test_a_reward_of_an_earlier_step_is_explained_by_its_row(late):
     reward = torch.cat([torch.zeros(late, envs), earned[: steps - late]])
     shape = {"obs": obs[:-1], "action": action, "reward": reward, "next_obs": obs[1:], "terminated": done}
     rows = Rollout(**shape, truncated=~done & done, valid=torch.ones_like(done))
-    share = paid_before(rows, spec_of(), of_effects(rows[rows.valid], spec_of())["reward/explained"]).item()
+    share = paid_before(rows, spec_of(), effect_signals(rows[rows.valid], spec_of())["reward/explained"]).item()
     assert share > 0.7 if late else share < -0.3  # the row before knows the observation, and no action
 
 
@@ -282,13 +284,13 @@ def test_actions_explain_what_they_do():
     moved = obs.clone()
     moved[:, 1] += action[:, 0]
     pays = action.square().sum(1)
-    found = of_effects(rows(obs=obs, action=action, next_obs=moved, reward=pays), spec_of())
+    found = effect_signals(rows(obs=obs, action=action, next_obs=moved, reward=pays), spec_of())
     assert found["action/effect"] == pytest.approx(1)
     assert found["reward/explained"] == pytest.approx(1)
     assert found["action/paid"] < 0.1  # of squares, no line explains anything
-    paid = of_effects(rows(obs=obs, action=action, reward=action.sum(1)), spec_of())
+    paid = effect_signals(rows(obs=obs, action=action, reward=action.sum(1)), spec_of())
     assert paid["action/paid"] == pytest.approx(1)
-    still = of_effects(rows(obs=obs, action=action, next_obs=obs + 0.1 * numbers(B, O, seed=5).float()), spec_of())
+    still = effect_signals(rows(obs=obs, action=action, next_obs=obs + 0.1 * numbers(B, O, seed=5).float()), spec_of())
     assert still["action/effect"] < 0.05
     assert abs(still["reward/explained"]) < 0.1
 
@@ -300,19 +302,19 @@ def test_a_number_of_the_action_without_effect_is_the_weakest():
         moved = obs + 0.1 * numbers(B, O, seed=5).float()
         for column, effect in enumerate(effects):
             moved[:, column] += effect * action[:, column]
-        return of_effects(rows(obs=obs, action=action, next_obs=moved), spec_of())["action/weakest"].item()
+        return effect_signals(rows(obs=obs, action=action, next_obs=moved), spec_of())["action/weakest"].item()
 
     assert weakest(1.0, 1.0) > 0.9
     assert weakest(1.0, 0.0) < 0.02
     alone = rows(action=action[:, :1])
-    assert "action/weakest" not in of_effects(alone, spec_of(Box((-1.0,), (1.0,))))
+    assert "action/weakest" not in effect_signals(alone, spec_of(Box((-1.0,), (1.0,))))
 
 
 def test_actions_of_a_sign_without_effect_explain_nothing():
     obs, action = numbers(B, O).float(), numbers(B, A, seed=1).float()
 
     def half(moved):
-        return of_effects(rows(obs=obs, action=action, next_obs=moved), spec_of())["action/half"].item()
+        return effect_signals(rows(obs=obs, action=action, next_obs=moved), spec_of())["action/half"].item()
 
     moved = obs + 0.1 * numbers(B, O, seed=5).float()
     moved[:, :A] += action
@@ -322,9 +324,9 @@ def test_actions_of_a_sign_without_effect_explain_nothing():
     moved[:, 1] += action[:, 1].clamp(max=0)  # of one number they have an effect
     assert half(moved) > 0.9
     by_sign = rows(obs=obs, action=action, next_obs=obs + action.sign() @ torch.eye(A, O))
-    assert of_effects(by_sign, spec_of())["action/half"] > 0.5
+    assert effect_signals(by_sign, spec_of())["action/half"] > 0.5
     positive = rows(obs=obs, action=action.abs(), next_obs=obs + action.abs() @ torch.eye(A, O))
-    assert "action/half" not in of_effects(positive, spec_of())
+    assert "action/half" not in effect_signals(positive, spec_of())
 
 
 def test_the_time_is_no_servo():
@@ -342,7 +344,7 @@ def test_the_time_is_no_servo():
 @pytest.mark.filterwarnings("error")
 def test_one_step_episodes_have_signals():
     obs = numbers(B, O).float()
-    found = of_effects(rows(obs=obs, terminated=torch.ones(B, dtype=torch.bool)), spec_of())
+    found = effect_signals(rows(obs=obs, terminated=torch.ones(B, dtype=torch.bool)), spec_of())
     assert "observation/pace" not in found
 
 
@@ -350,14 +352,14 @@ def test_of_many_environments_some_are_looked_at():
     """Of the first there are lines; those beyond `MOST_ROWS` rows change nothing of them."""
     many = {name: torch.cat([column] * 30, 1) for name, column in vars(delayed(3)).items()}
     other = many | {"next_obs": torch.cat([many["next_obs"][:, :60], numbers(200, 60, O, seed=7).float()], 1)}
-    one, two = (of_environment(Rollout(**columns), spec_of()) for columns in (many, other))
+    one, two = (environment_signals(Rollout(**columns), spec_of()) for columns in (many, other))
     assert one["action/late"] == two["action/late"] > 0.9
 
 
 def test_of_several_choices_at_once_none_are_compared():
     obs, action = numbers(B, O).float(), torch.randint(0, 2, (B, 2), generator=torch.Generator().manual_seed(0))
     moved = obs + (action[:, :1] + 2 * action[:, 1:])
-    found = of_effects(rows(obs=obs, action=action, next_obs=moved), spec_of(MultiDiscrete((2, 2), (0, 0))))
+    found = effect_signals(rows(obs=obs, action=action, next_obs=moved), spec_of(MultiDiscrete((2, 2), (0, 0))))
     assert "action/alike" not in found
 
 
@@ -366,7 +368,7 @@ def test_two_choices_that_do_the_same_are_alike():
 
     def alike(*effects, action=action):
         moved = obs + 0.1 * numbers(B, O, seed=5).float() + torch.tensor(effects)[action][:, None]
-        return of_effects(rows(obs=obs, action=action, next_obs=moved), spec_of(Discrete(4))).get("action/alike")
+        return effect_signals(rows(obs=obs, action=action, next_obs=moved), spec_of(Discrete(4))).get("action/alike")
 
     assert alike(0.0, 5.0, -1.0, 2.0) > 0.9
     assert alike(0.0, 5.0, -1.0, 5.0) < 0.02
@@ -377,14 +379,14 @@ def test_two_choices_that_do_the_same_are_alike():
 def test_the_pace_is_that_of_the_number_that_moves_most():
     obs = numbers(B, O).float()
     moved = obs + torch.tensor([0.0, 0.5, 0.01])[:O]
-    found = of_effects(rows(obs=obs, next_obs=moved), spec_of())
+    found = effect_signals(rows(obs=obs, next_obs=moved), spec_of())
     assert found["observation/pace"] == pytest.approx(0.5 / obs[:, 1].std(correction=0).item(), rel=1e-5)
 
 
 def test_choices_explain_what_they_do():
     obs, action = numbers(B, O).float(), torch.arange(B) % 4
     moved = obs + torch.tensor([0.0, 5.0, -1.0, 2.0])[action][:, None]
-    found = of_effects(rows(obs=obs, action=action, next_obs=moved), spec_of(Discrete(4)))
+    found = effect_signals(rows(obs=obs, action=action, next_obs=moved), spec_of(Discrete(4)))
     assert found["action/effect"] == pytest.approx(1)
 
 
@@ -394,12 +396,12 @@ def test_sizes_and_shares():
     ends = torch.arange(B) % 10 == 9
     action = torch.where(torch.arange(B)[:, None] % 4 == 0, 1.0, 0.5).expand(B, A)
     truncated = ends & (torch.arange(B) % 20 == 19)
-    found = of_rows(rows(obs=obs, action=action, terminated=ends & ~truncated, truncated=truncated), spec_of())
+    found = row_signals(rows(obs=obs, action=action, terminated=ends & ~truncated, truncated=truncated), spec_of())
     assert found["observation/constant"] == pytest.approx(1 / 3)
     assert found["observation/largest"] == 7
     assert found["action/at_bounds"] == 0.25
     assert found["episode/terminated"] == 0.5
-    assert "action/at_bounds" not in of_rows(rows(action=torch.zeros(B, dtype=torch.int64)), spec_of(Discrete(2)))
+    assert "action/at_bounds" not in row_signals(rows(action=torch.zeros(B, dtype=torch.int64)), spec_of(Discrete(2)))
 
 
 def stop_at(at):
@@ -422,7 +424,7 @@ def test_inactive_units_are_counted(kind):
         layer.weight.copy_(0.5 * numbers(8, O, seed=2))
         layer.bias.zero_()
         layer.bias[:6] = -50.0  # of ReLU zero, of tanh at its bound
-    found = of_networks(SimpleNamespace(policy=Policy(nn.Sequential(layer, kind()), NoNorm(O))), rows())
+    found = network_signals(SimpleNamespace(policy=Policy(nn.Sequential(layer, kind()), NoNorm(O))), rows())
     assert found["network/inactive"] == 0.75
     assert found["network/rank"] <= 3 / 8
     assert found["network/saturated"] == pytest.approx(0.75 * (kind is nn.Tanh), abs=0.1)
@@ -434,7 +436,7 @@ def test_the_rank_is_that_of_the_features():
     with torch.no_grad():
         layer.weight.copy_(1e-4 * torch.outer(torch.arange(1.0, 9), torch.tensor([1.0, 2, 3])))
         layer.bias.zero_()
-    found = of_networks(SimpleNamespace(policy=Policy(nn.Sequential(layer, nn.Tanh()), NoNorm(O))), rows())
+    found = network_signals(SimpleNamespace(policy=Policy(nn.Sequential(layer, nn.Tanh()), NoNorm(O))), rows())
     assert found["network/rank"] == 1 / 8
 
 
@@ -445,7 +447,7 @@ def test_units_that_begin_with_one_number_are_alike():
         with torch.no_grad():
             layer.weight.copy_(weights)
             layer.bias.zero_()
-        return of_networks(SimpleNamespace(policy=Policy(nn.Sequential(layer, nn.Tanh()), NoNorm(O))), rows())
+        return network_signals(SimpleNamespace(policy=Policy(nn.Sequential(layer, nn.Tanh()), NoNorm(O))), rows())
 
     assert alike(torch.full((8, O), 0.1))["network/alike"] == 1
     assert alike(torch.arange(8.0)[:, None] * torch.ones(O))["network/alike"] == 1 / 8  # of rank 1, too
@@ -456,8 +458,8 @@ def test_a_normalizer_that_is_behind_shows_its_offset():
     normalizer = RunningNorm(O)
     normalizer.update(numbers(B, O, seed=7).float())
     policy = Policy(nn.Identity(), normalizer)
-    assert of_networks(SimpleNamespace(policy=policy), rows())["normalizer/offset"] < 0.2
-    found = of_networks(SimpleNamespace(policy=policy), rows(obs=numbers(B, O).float() + 5))
+    assert network_signals(SimpleNamespace(policy=policy), rows())["normalizer/offset"] < 0.2
+    found = network_signals(SimpleNamespace(policy=policy), rows(obs=numbers(B, O).float() + 5))
     assert found["normalizer/offset"] == pytest.approx(5, abs=0.5)
     assert found["normalizer/count"] == B
 
@@ -540,10 +542,10 @@ class Steady(nn.Module):
 )
 def test_the_share_of_the_value_that_is_missing(size, reward, missing):
     state, config = SimpleNamespace(networks=Steady(size)), SimpleNamespace(gamma=0.9)
-    found = of_values(state, config, rows(reward=torch.full((B,), reward))[None])
+    found = value_signals(state, config, rows(reward=torch.full((B,), reward))[None])
     assert found["value/missing"] == pytest.approx(missing, abs=1e-5)  # (V of the policy, 10, less V) / |V|
     assert found["value/mean"] == size
-    assert of_values(state, SimpleNamespace(gamma=1.0), rows()[None]).keys() == {"value/mean"}
+    assert value_signals(state, SimpleNamespace(gamma=1.0), rows()[None]).keys() == {"value/mean"}
 
 
 def test_what_the_value_awaits_beyond_an_end():
@@ -551,11 +553,11 @@ def test_what_the_value_awaits_beyond_an_end():
     reward, terminated = torch.zeros(B), torch.zeros(B, dtype=torch.bool)
     reward[[5, 9]], terminated[[5, 9]] = torch.tensor([1.0, 2.0]), True
     state, config = SimpleNamespace(networks=Steady(4.0)), SimpleNamespace(gamma=0.9)
-    assert of_values(state, config, rows(reward=reward, terminated=terminated)[None])["value/at_ends"] == 2.5 / 4
-    assert of_values(state, config, rows(reward=reward - 11, terminated=terminated)[None])["value/at_ends"] == 1
+    assert value_signals(state, config, rows(reward=reward, terminated=terminated)[None])["value/at_ends"] == 2.5 / 4
+    assert value_signals(state, config, rows(reward=reward - 11, terminated=terminated)[None])["value/at_ends"] == 1
     state = SimpleNamespace(networks=Steady(-4.0))
-    assert of_values(state, config, rows(reward=-reward, terminated=terminated)[None])["value/at_ends"] == 2.5 / 4
-    assert "value/at_ends" not in of_values(state, config, rows(truncated=terminated)[None])
+    assert value_signals(state, config, rows(reward=-reward, terminated=terminated)[None])["value/at_ends"] == 2.5 / 4
+    assert "value/at_ends" not in value_signals(state, config, rows(truncated=terminated)[None])
 
 
 T, N = 16, 4
@@ -602,14 +604,14 @@ def test_the_correlation_of_advantages_and_of_what_an_update_did_to_the_policy(a
     newest = rows.valid.numpy() & (np.arange(T) >= T - 12)[:, None]
     expected = np.corrcoef(advantage[newest], change[newest])[0, 1]
     config = SimpleNamespace(gamma=0.9, num_steps=12)
-    found = of_update(state, config, rows, before)
+    found = update_signals(state, config, rows, before)
     assert found["advantage/followed"].item() == pytest.approx(expected, abs=1e-4)
     target = (advantage + value.numpy())[newest]
     left = np.var(target - value.numpy()[newest]) / np.var(target)
     assert found["value/explained"].item() == pytest.approx(1 - left, abs=1e-4)
-    still = of_update(state, config, rows, acted_with(state))
+    still = update_signals(state, config, rows, acted_with(state))
     assert still["advantage/followed"] == still["network/moved"] == 0
-    assert of_update(state, config, rows, None) == {}
+    assert update_signals(state, config, rows, None) == {}
 
 
 def test_where_every_target_is_the_same_there_is_nothing_to_explain():
@@ -619,7 +621,7 @@ def test_where_every_target_is_the_same_there_is_nothing_to_explain():
             parameter.zero_()
     rows = replace(rows, reward=torch.ones(T, N), terminated=torch.ones(T, N).bool())
     config = SimpleNamespace(gamma=0.9, num_steps=T)
-    assert "value/explained" not in of_update(state, config, rows, acted_with(state))
+    assert "value/explained" not in update_signals(state, config, rows, acted_with(state))
 
 
 def test_v_is_measured_in_units_of_scaled_rewards():
@@ -639,17 +641,17 @@ def test_the_way_of_a_policy_is_that_of_its_parameters_alone():
     before = acted_with(state)
     state.policy.observe(5 * rows.obs, rows.valid)
     config = SimpleNamespace(gamma=0.9, num_steps=12)
-    assert of_update(state, config, rows, before)["network/moved"] == 0
+    assert update_signals(state, config, rows, before)["network/moved"] == 0
     with torch.no_grad():
         for parameter in state.policy.parameters():
             parameter *= 1.25
-    found = of_update(state, config, rows, before)
+    found = update_signals(state, config, rows, before)
     assert found["network/moved"].item() == pytest.approx(0.2)
     assert found["value/moved"] == 0
     with torch.no_grad():
         for parameter in state.networks.value.parameters():
             parameter *= 0.5
-    assert of_update(state, config, rows, before)["value/moved"].item() == pytest.approx(1.0)
+    assert update_signals(state, config, rows, before)["value/moved"].item() == pytest.approx(1.0)
 
 
 def test_ppo_follows_its_advantages_and_with_a_wrong_sign_it_does_not(tmp_path):
@@ -666,22 +668,22 @@ def test_ppo_follows_its_advantages_and_with_a_wrong_sign_it_does_not(tmp_path):
 
 def test_numbers_that_are_cut_off_stand_at_their_limits():
     obs = numbers(B, O).float()
-    assert of_rows(rows(obs=obs), spec_of())["observation/at_limits"].item() == pytest.approx(2 / B)
-    assert of_rows(rows(obs=obs), spec_of())["observation/whole"] == 0
+    assert row_signals(rows(obs=obs), spec_of())["observation/at_limits"].item() == pytest.approx(2 / B)
+    assert row_signals(rows(obs=obs), spec_of())["observation/whole"] == 0
     half = torch.cat([(3 * obs[:, :2]).round(), obs[:, 2:]], dim=1)
-    assert of_rows(rows(obs=half), spec_of())["observation/whole"].item() == pytest.approx(2 / O)
+    assert row_signals(rows(obs=half), spec_of())["observation/whole"].item() == pytest.approx(2 / O)
     cut = torch.cat([(obs[:, :2] * 100).clamp(-1, 1), (obs[:, 2:] > 0).float()], dim=1)  # the last has two values alone
     expected = (cut[:, :2].abs() == 1).float().mean().item()
     assert expected > 0.9
-    assert of_rows(rows(obs=cut), spec_of())["observation/at_limits"].item() == pytest.approx(expected)
-    assert "observation/at_limits" not in of_rows(rows(obs=(obs > 0).float()), spec_of())
+    assert row_signals(rows(obs=cut), spec_of())["observation/at_limits"].item() == pytest.approx(expected)
+    assert "observation/at_limits" not in row_signals(rows(obs=(obs > 0).float()), spec_of())
 
 
 @pytest.mark.parametrize("times", [0.5, 100.0])
 def test_the_signs_of_actions_that_are_cut_off_explain_what_is_left(times):
     action = numbers(B, A, seed=1).clamp(-1, 1)
     moved = torch.cat([(times * action).clamp(-1, 1), torch.zeros(B, 1)], dim=1)
-    found = of_effects(rows(action=action.float(), next_obs=(numbers(B, O) + moved).float()), spec_of())
+    found = effect_signals(rows(action=action.float(), next_obs=(numbers(B, O) + moved).float()), spec_of())
     assert (found["action/by_sign"] > 0.9) == (times > 1)
 
 
@@ -694,11 +696,11 @@ def test_episodes_that_begin_alike():
     obs[[2, 4], 0] = obs[3, 1] = 7.0
     flags = {"terminated": terminated, "truncated": torch.zeros_like(terminated), "valid": valid}
     found = {"obs": obs, "next_obs": obs, "action": torch.zeros(6, 2, A), "reward": torch.zeros(6, 2), **flags}
-    assert of_starts(Rollout(**found), spec_of())["observation/starts_alike"] == 1
+    assert start_signals(Rollout(**found), spec_of())["observation/starts_alike"] == 1
     found["obs"][3, 1, 0] = 6.0
-    assert of_starts(Rollout(**found), spec_of())["observation/starts_alike"] == 0
+    assert start_signals(Rollout(**found), spec_of())["observation/starts_alike"] == 0
     terminated[1] = False
-    assert of_starts(Rollout(**found), spec_of()) == {}  # two beginnings say nothing
+    assert start_signals(Rollout(**found), spec_of()) == {}  # two beginnings say nothing
 
 
 def test_of_targets_the_distance_and_of_replay_what_stands_still(tmp_path):
@@ -759,7 +761,7 @@ def test_the_policys_action_stands_beside_one_at_random(action, weight, share):
     networks.critics.weight.data.fill_(weight)
     state = SimpleNamespace(replay=replay, updates=1, networks=networks, targets=QIsTheAction(), policy=AtAnEnd(action))
     rows = Rollout(**vars(columns), truncated=columns.terminated, valid=~columns.terminated)
-    found = of_critics(state, SimpleNamespace(gamma=0.9), rows)
+    found = critic_signals(state, SimpleNamespace(gamma=0.9), rows)
     assert found["action/preferred"] == share
     assert "value/explained" not in found  # targets that are all alike
 
@@ -771,7 +773,7 @@ def test_the_share_of_the_buffer_that_is_drawn_from_is_told(drawn, share):
     networks = SimpleNamespace(critics=QIsTheAction(), entropy_bonus=lambda *_: 0.0)
     of = {"networks": networks, "targets": QIsTheAction(), "policy": AtAnEnd(1.0)}
     state = SimpleNamespace(replay=Drawn(columns, torch.tensor(drawn)), updates=1, **of)
-    assert of_critics(state, SimpleNamespace(gamma=0.9), taken)["replay/drawn"].item() == pytest.approx(share)
+    assert critic_signals(state, SimpleNamespace(gamma=0.9), taken)["replay/drawn"].item() == pytest.approx(share)
 
 
 def test_of_the_sampled_targets_q_explains_its_share():
@@ -783,7 +785,7 @@ def test_of_the_sampled_targets_q_explains_its_share():
     replay = Drawn(columns, torch.arange(B))
     networks = SimpleNamespace(critics=QIsTheAction(), entropy_bonus=lambda *_: 0.0)
     state = SimpleNamespace(replay=replay, updates=1, networks=networks, targets=QIsTheAction(), policy=AtAnEnd(1.0))
-    found = of_critics(state, SimpleNamespace(gamma=0.9), taken)
+    found = critic_signals(state, SimpleNamespace(gamma=0.9), taken)
     expected = 1 - 0.25 * noise.var() / reward.var()
     assert found["value/explained"].item() == pytest.approx(expected.item(), rel=1e-5)
 
@@ -794,7 +796,7 @@ def test_a_q_without_replay_is_measured_at_the_newest_rows():
     networks = SimpleNamespace(q=lambda obs, action: action[:, 0] + 0 * obs[:, 0], entropy_bonus=lambda *_: 0.5)
     state = SimpleNamespace(networks=networks, policy=AtAnEnd(1.0))
     taken = rows(action=torch.full((B, 1), 0.5), reward=torch.full((B,), -2.0), terminated=ends)
-    found = of_critics(state, SimpleNamespace(gamma=0.9), taken)
+    found = critic_signals(state, SimpleNamespace(gamma=0.9), taken)
     names = {"action/preferred", "action/most_entropy", "value/missing", "value/at_ends", "value/explained"}
     assert found.keys() == names
     assert found["action/preferred"] == 1
@@ -838,18 +840,18 @@ def test_what_stands_otherwise_in_the_replay_buffer_is_found(changed):
                 one.valid,
             ),
         )
-    found = of_replay(SimpleNamespace(replay=replay), recent)
+    found = replay_signals(SimpleNamespace(replay=replay), recent)
     assert found == {
         f"replay/other_{name}": float(name == changed) for name in ("actions", "next", "signs", "ends", "limits")
     }
-    assert of_replay(SimpleNamespace(replay=None), recent) == {}
+    assert replay_signals(SimpleNamespace(replay=None), recent) == {}
 
 
 def test_rows_that_look_alike_differ_where_none_of_them_agrees():
     same = rows(obs=torch.zeros(B, O), action=torch.zeros(B, A))
     replay = ReplayBuffer(spec_of(), B, torch.device("cpu"))
     replay.extend(Transition(same.obs, same.action, same.reward, same.next_obs, same.terminated))
-    found = of_replay(SimpleNamespace(replay=replay), same[None])
+    found = replay_signals(SimpleNamespace(replay=replay), same[None])
     assert len(found) == 3
     assert not any(found.values())
 
@@ -859,7 +861,7 @@ def test_the_distance_from_the_mode_is_one_for_actions_that_were_drawn():
     obs = numbers(B, O).float()
     noise = networks.policy.draw_noise((B,), torch.Generator().manual_seed(1))
     for action, away in ((networks.policy.act(obs, noise), 1.0), (networks.policy.act(obs, 0 * noise), 0.0)):
-        found = of_networks(SimpleNamespace(policy=networks.policy), rows(obs=obs, action=action))
+        found = network_signals(SimpleNamespace(policy=networks.policy), rows(obs=obs, action=action))
         assert found["action/off_mode"].item() == pytest.approx(away, abs=0.1)
 
 
@@ -867,9 +869,9 @@ def test_a_choice_that_hardly_ever_leaves_the_mode_says_nothing():
     networks = ActorCritic(spec_of(Discrete(3)), Layers((8,)), 0.0)
     given = rows(action=torch.zeros(B, dtype=torch.int64))
     state = SimpleNamespace(policy=networks.policy)
-    assert of_networks(state, given)["action/off_mode"] > 0.5
+    assert network_signals(state, given)["action/off_mode"] > 0.5
     networks.policy.net[-1].bias.data[0] = 10.0
-    assert "action/off_mode" not in of_networks(state, given)
+    assert "action/off_mode" not in network_signals(state, given)
 
 
 def test_rows_that_were_written_over_and_episodes_under_way_are_not_looked_for():
@@ -877,9 +879,9 @@ def test_rows_that_were_written_over_and_episodes_under_way_are_not_looked_for()
     full = ReplayBuffer(spec_of(), 50, torch.device("cpu"))
     late = given[-50:]
     full.extend(Transition(late.obs, late.action, late.reward, late.next_obs, late.terminated))
-    assert not any(of_replay(SimpleNamespace(replay=full), given[None]).values())
+    assert not any(replay_signals(SimpleNamespace(replay=full), given[None]).values())
     hindsight = object.__new__(HindsightReplay)
-    assert of_replay(SimpleNamespace(replay=hindsight), given[None]) == {}
+    assert replay_signals(SimpleNamespace(replay=hindsight), given[None]) == {}
 
 
 def test_before_there_are_rows_there_are_no_signals():
@@ -1443,7 +1445,7 @@ def test_gradient_steps_of_ones_own_are_given_what_they_are_given(given):
     assert state.learn(*given[0], **given[1]) == given
     data, by_step, is_one = watched.given
     assert (data, by_step, is_one) == (given[0][2] if len(given[0]) > 2 else None, (), False)
-    assert of_batch(SimpleNamespace(), watched.given, time_rows()) == {}
+    assert batch_signals(SimpleNamespace(), watched.given, time_rows()) == {}
     watched.end()
     assert state.learn() == ((), {})
 
@@ -1458,9 +1460,9 @@ def time_rows(steps=8, envs=2):
 def test_targets_that_are_all_zero_say_nothing_of_a_discount():
     newest = time_rows()
     batch = Batch(newest.obs.flatten(0, 1), newest.action.flatten(0, 1), *torch.zeros(3, 16))
-    found = of_batch(SimpleNamespace(gae_lambda=0.95), (batch, (), False), newest)
+    found = batch_signals(SimpleNamespace(gae_lambda=0.95), (batch, (), False), newest)
     assert not {"targets/discount", "targets/unexplained"} & found.keys()
-    whole = of_batch(SimpleNamespace(episodes=1), (batch, (), False), newest)
+    whole = batch_signals(SimpleNamespace(episodes=1), (batch, (), False), newest)
     assert whole == {}, "of whole episodes the rows have been moved together"
 
 
@@ -1475,9 +1477,9 @@ def test_an_episode_that_begins_where_the_last_one_ended_goes_on(resets):
         obs[t], next_obs[t] = place, place + steps[t] + 1
         place = torch.zeros(2, O) if resets and ends[t, 0] else next_obs[t]
     no = torch.zeros_like(ends)
-    found = of_starts(Rollout(obs, torch.zeros(40, 2, A), torch.zeros(40, 2), next_obs, ends, no, ~no), spec_of())
+    found = start_signals(Rollout(obs, torch.zeros(40, 2, A), torch.zeros(40, 2), next_obs, ends, no, ~no), spec_of())
     assert found["observation/goes_on"] == float(not resets)
-    behind = of_starts(
+    behind = start_signals(
         Rollout(obs, torch.zeros(40, 2, A), torch.zeros(40, 2), next_obs, ends, no, ~ends.roll(1, 0)), spec_of()
     )
     assert "observation/goes_on" not in behind, "between them stands the row of a reset"

@@ -453,7 +453,7 @@ def playing(
         with globals_undisturbed():
             for module in modes:
                 module.training = False
-            player = Agent(policy, vec.spec, _seen(vec, seed), deterministic, bool(normalized))
+            player = Agent(policy, vec.spec, _first_observations(vec, seed), deterministic, bool(normalized))
             if file:
                 say(f"{said}; {_choose_units(player, vec, seed, normalized)}.")
             seed_globals(seed)
@@ -463,7 +463,7 @@ def playing(
             module.training = mode
 
 
-def _seen(vec: VecEnv, seed: int) -> np.ndarray:
+def _first_observations(vec: VecEnv, seed: int) -> np.ndarray:
     """The first observations from a seed, [T, N, O], of random play; of what may be a robot, the first alone."""
     seed %= 2**32  # of JAX it must be one of these
     rows, drawn = [vec.restart(seed).numpy()], torch.Generator().manual_seed(seed)

@@ -38,7 +38,7 @@ from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
 from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.run.seeding import torch_defaults
-from lemniscate.run.signals import of_environment
+from lemniscate.run.signals import environment_signals
 from lemniscate.spec import Spec
 from lemniscate.system.console import say
 from lemniscate.system.files import DamagedFileError, at_home, file_in_the_way, make_directory, read_json, write_json
@@ -255,7 +255,7 @@ def _doctor_sentences(rollouts: Sequence[Rollout], spec: Spec) -> list[str]:
     halves = [
         rows[half] for rows in rollouts for half in (slice(len(rows.done) // 2), slice(len(rows.done) // 2, None))
     ]
-    return doctor.of_random_play([of_environment(rows, spec) for rows in halves if rows.valid.sum() > 1])
+    return doctor.random_play_faults([environment_signals(rows, spec) for rows in halves if rows.valid.sum() > 1])
 
 
 def runs_in(what: str) -> list[Path]:

@@ -79,7 +79,7 @@ RESULTS: Mapping[str, Change] = {
 }
 
 
-def of_arguments(values: Values) -> Iterator[tuple[str, Callable[[Values], Values]]]:
+def argument_changes(values: Values) -> Iterator[tuple[str, Callable[[Values], Values]]]:
     """Every change of arguments and options such as these, by what it is called: it gives those that are others."""
     for one, other in combinations(values, 2):
         if _alike(values[one], values[other]):
@@ -103,7 +103,7 @@ def _changes_of(value: Any) -> Iterator[tuple[str, Change]]:
             yield f"{{}} is not looked at: it is {constant:g}, a constant", lambda _, constant=constant: constant
 
 
-def of_results(outputs: tuple[str, ...]) -> Iterator[tuple[str, Callable[[list[Tensor], int], list[Tensor]]]]:
+def result_changes(outputs: tuple[str, ...]) -> Iterator[tuple[str, Callable[[list[Tensor], int], list[Tensor]]]]:
     """Every change of the results, by what it is called; it is told the number of rows that a mean is taken over."""
     if len(outputs) > 1:
         yield "the results are returned in another order", lambda found, _: found[::-1]
@@ -371,9 +371,9 @@ class Exercise:
     def _changed(self) -> Iterator[tuple[str, Callable[[Case], Results]]]:
         """The reference with changed arguments or changed results, by the words for the change."""
         last = self.cases[-1]
-        for words, change in of_arguments({**dict(zip(self.arguments, last.args, strict=False)), **last.options}):
+        for words, change in argument_changes({**dict(zip(self.arguments, last.args, strict=False)), **last.options}):
             yield words, partial(self.answer, self.right, change=change)
-        for words, change in of_results(self.outputs):
+        for words, change in result_changes(self.outputs):
             yield words, partial(self._with_results, change)
 
     def _with_results(self, change: Callable[[list[Tensor], int], list[Tensor]], case: Case) -> Results:

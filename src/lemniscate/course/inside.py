@@ -426,7 +426,7 @@ def judged(seen: Mapping[str, Any]) -> Verdict:
     is_proved, them = True, list[Update]()
     with suppress(Exception):
         them = list(updates(seen))
-    for point in (of_optimizers, of_rows, of_policy, of_critic):
+    for point in (optimizer_mistakes, row_mistakes, policy_mistakes, critic_mistakes):
         with suppress(Exception):  # an `UnclearError`, or of numbers of another form: no fault of the loop's
             if sentence := point(seen, them):
                 return Verdict(sentence)
@@ -435,7 +435,7 @@ def judged(seen: Mapping[str, Any]) -> Verdict:
     return Verdict(None, is_proved)
 
 
-def of_optimizers(seen: Mapping[str, Any], them: list[Update]) -> str | None:
+def optimizer_mistakes(seen: Mapping[str, Any], them: list[Update]) -> str | None:
     """Parameters that no step reaches, and gradients that a step takes twice."""
     graded = {one["out"].shape[1] for one in seen["events"] if "grad" in one and one["grad"].any()}
     has_steps = any("out" not in event for event in seen["events"])
@@ -475,7 +475,7 @@ def _is_added_up(events: list[dict[str, Any]], k: int) -> bool:
     return False
 
 
-def of_rows(seen: Mapping[str, Any], them: list[Update]) -> str | None:
+def row_mistakes(seen: Mapping[str, Any], them: list[Update]) -> str | None:
     """Rows that are not trained on; the first rollout and one that may have been cut off do not count."""
     used = [torch.cat([step.rows for step in each.policy]).unique() + each.places[0] for each in them if each.policy]
     if not used:
@@ -494,7 +494,7 @@ def of_rows(seen: Mapping[str, Any], them: list[Update]) -> str | None:
     return None
 
 
-def of_policy(seen: Mapping[str, Any], them: list[Update]) -> str | None:
+def policy_mistakes(seen: Mapping[str, Any], them: list[Update]) -> str | None:
     """The advantages, the ratio and the entropy in the policy's loss."""
     steps = [(update, step, update.env["action"].flatten()[step.rows]) for update in them for step in update.policy]
     if any(_is_of_others(step, action) for _, step, action in steps):
@@ -512,10 +512,10 @@ def of_policy(seen: Mapping[str, Any], them: list[Update]) -> str | None:
         return SAYS["same_weight"]
     fit = search(samples[:2])
     if fit.error > FAILS:
-        return _of_advantages(samples[:2], fit)
+        return _advantage_mistake(samples[:2], fit)
     if fit.error > FITS:
         raise UnclearError
-    return _of_settings(seen["settings"], fit) or _of_ratio(weights, samples, fit)
+    return _setting_mistake(seen["settings"], fit) or _ratio_mistake(weights, samples, fit)
 
 
 def _sample(update: Update, step: Step, y: Tensor) -> Sample:
@@ -546,7 +546,7 @@ def _are_twice(steps: list[tuple[Update, Step, Tensor]]) -> bool:
     return any(x > FAILS for x in apart[::2]) and all(x < FITS for x in apart[1::2])
 
 
-def _of_advantages(samples: list[Sample], right: Fit) -> str | None:
+def _advantage_mistake(samples: list[Sample], right: Fit) -> str | None:
     """The wrong advantage, or the wrong rows, that fit where the right one does not."""
     if words := form_that_fits(samples, 0):
         return f"the weights of log π are not the advantages. Likely: {words}."
@@ -568,7 +568,7 @@ def _log_prob(logits: Tensor, action: Tensor) -> Tensor:
     return logits.log_softmax(1).gather(1, action[:, None])[:, 0]
 
 
-def _of_settings(settings: Mapping[str, list[float]], fit: Fit) -> str | None:
+def _setting_mistake(settings: Mapping[str, list[float]], fit: Fit) -> str | None:
     """Whether γ or λ is left out, by the only ones that the file names."""
     if [len(settings["gamma"]), len(settings["lam"])] != [1, 1]:
         return None
@@ -595,7 +595,7 @@ class Weight(NamedTuple):
     to_latest: Tensor
 
 
-def _of_ratio(weights: list[tuple[Update, Step, Tensor, float]], samples: list[Sample], fit: Fit) -> str | None:
+def _ratio_mistake(weights: list[tuple[Update, Step, Tensor, float]], samples: list[Sample], fit: Fit) -> str | None:
     """The ratio, its clip and the sign of the policy's loss, where the advantages are known."""
     kinds = list(_known_weights(weights, samples, fit))
     if not kinds and list(_known_weights(weights, samples, fit, -1.0)):
@@ -678,7 +678,7 @@ def _misfit(objective: Any, weights: list[Weight], edges: tuple[float, float], s
     return float(torch.stack(rests).quantile(share))
 
 
-def of_critic(seen: Mapping[str, Any], them: list[Update]) -> str | None:
+def critic_mistakes(seen: Mapping[str, Any], them: list[Update]) -> str | None:
     """The target and the sign of the critic's loss, in the first steps of updates."""
     samples = []
     for update in them:
@@ -693,10 +693,10 @@ def of_critic(seen: Mapping[str, Any], them: list[Update]) -> str | None:
     if fit.error < FITS:
         is_turned = all(float(each[0]) < 0 for each in fit.coefficients)
         return SAYS["value_sign"] if is_turned else SAYS["value_reward"] if fit.gamma < 1e-3 else None
-    return _of_targets(samples, fit)
+    return _target_mistake(samples, fit)
 
 
-def _of_targets(samples: list[Sample], right: Fit) -> str:
+def _target_mistake(samples: list[Sample], right: Fit) -> str:
     """The wrong target, or the wrong rows, that fit where the right one does not."""
     if right.error < FAILS:
         raise UnclearError

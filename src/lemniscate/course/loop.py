@@ -122,7 +122,7 @@ def notebook(program: str) -> str:
     return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
 
-def seen_in(state: int) -> np.ndarray:
+def observation_of(state: int) -> np.ndarray:
     """The observation of a state of a small world: a one-hot vector [6]."""
     return np.eye(6, dtype=np.float32)[state]
 
@@ -150,7 +150,7 @@ class WorldEnv(gym.Env):
         return self._obs(), reward, end == "death", end == "time-out", {}
 
     def _obs(self) -> np.ndarray:
-        return seen_in(self.world.get("seen", range(6))[self._state])
+        return observation_of(self.world.get("seen", range(6))[self._state])
 
 
 class BoxEnv(WorldEnv):
@@ -165,7 +165,7 @@ class BoxEnv(WorldEnv):
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
         """A death after one action."""
         self.taken.append(action)
-        return seen_in(0), float(action[0] - action[1]), True, False, {}
+        return observation_of(0), float(action[0] - action[1]), True, False, {}
 
 
 WORLDS: list[dict[str, Any]] = tomllib.loads((TEMPLATES / "worlds.toml").read_text("utf-8"))["world"]
@@ -281,7 +281,7 @@ def _trained(function: Function, envs: VectorView, is_right: Callable[[np.ndarra
 def _mean_action(function: Function, envs: VectorView, steps: int) -> np.ndarray:
     """In state 0 of a small world, after training; over many rows, since a policy may draw its actions."""
     with acting(started(function, envs, steps), envs) as player:
-        return player(torch.from_numpy(seen_in(0)).repeat(64, 1)).mode().double().mean(0).numpy()
+        return player(torch.from_numpy(observation_of(0)).repeat(64, 1)).mode().double().mean(0).numpy()
 
 
 def acting(made: Any, envs: VectorView) -> AbstractContextManager[Agent]:

@@ -40,7 +40,7 @@ def _envs(num_envs: int, low: np.ndarray, high: np.ndarray, is_vector: bool = Tr
     return envs
 
 
-def _made(network: Function, envs: Any) -> Any:
+def _make_network(network: Function, envs: Any) -> Any:
     made = call_by_name(network, {ENVS: envs}, {"device": "cpu"})
     if not isinstance(made, nn.Module):
         raise TypeError(f"{type(made).__name__} is no nn.Module, so it has no parameters to train or to save")
@@ -51,7 +51,7 @@ def _for_one(network: Function, trial: Callable[[Any], Any], seen: Seen) -> Any:
     """A network for a vector of one environment; for a single environment, if it is one for that."""
 
     def attempt(is_vector: bool) -> Any:
-        trial(made := _made(network, _envs(1, LOW, HIGH, is_vector)))
+        trial(made := _make_network(network, _envs(1, LOW, HIGH, is_vector)))
         seen["is_vector"] = is_vector
         return made
 
@@ -102,7 +102,7 @@ def _saved(network: Function, made: Any, envs: Any, answer: Callable[[Any], Tens
     """Whether another network that is made alike answers the same, with all that this one has to save."""
     with suppress(Exception), torch.random.fork_rng([]), torch.no_grad():  # what raises is seen elsewhere
         torch.manual_seed(1)
-        twin = _made(network, envs)
+        twin = _make_network(network, envs)
         twin.load_state_dict(made.state_dict())
         return close(answer(made), plain(answer(twin)))
     return True
@@ -151,7 +151,7 @@ def _bend(function: Callable[[Tensor], Tensor], x: Tensor) -> float:
 
 def see_agent(network: Function, seen: Seen) -> None:
     """`Agent(envs)` with `value(x)` and `action_and_value(x, action=None, deterministic=False)`."""
-    made = _made(network, envs := _envs(2, -np.ones(A, np.float32), np.ones(A, np.float32)))
+    made = _make_network(network, envs := _envs(2, -np.ones(A, np.float32), np.ones(A, np.float32)))
     obs, rows = _obs(made), _obs(made, 2000)
 
     def act(x: Tensor, action: Tensor | None = None, deterministic: bool = False) -> Any:
@@ -603,7 +603,7 @@ def _of_pairs(batch: dict[str, Tensor]) -> Iterator[str]:
     elif not {*range(3, 9)} <= numbers:
         was = ", ".join(f"{number:g}" for number in sorted(numbers))
         yield f"of rows 1 to 8, of two environments, it holds {was}. Likely: one environment's takes the other's place."
-    yield from _whole(batch)
+    yield from _mixed_rows(batch)
 
 
 def _after_nine(batch: dict[str, Tensor]) -> Iterator[str]:
@@ -616,10 +616,10 @@ def _after_nine(batch: dict[str, Tensor]) -> Iterator[str]:
         yield f"after nine rows in six places it holds {was}; it should hold 4 to 9. Likely: {why}."
     if max(counts.values()) > 1.6 * min(counts.values()):
         yield "some rows are sampled much more often than others; each should be as likely as any other."
-    yield from _whole(batch)
+    yield from _mixed_rows(batch)
 
 
-def _whole(batch: dict[str, Tensor]) -> Iterator[str]:
+def _mixed_rows(batch: dict[str, Tensor]) -> Iterator[str]:
     """Sentences where the parts of a row are not of one transition."""
     numbers = batch["obs"][:, 0].tolist()
     right = {"action": [number / 10 for number in numbers], "reward": [-number / 4 for number in numbers]}

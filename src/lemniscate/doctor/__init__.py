@@ -89,7 +89,7 @@ IN_PLAY -= {"seed-ignored", "reward-zero", "reward-large", "no-episode"}
 """faults that random play shows and that the check of an environment has no sentence for"""
 
 
-def of_random_play(looks: Sequence[Mapping[str, float]]) -> list[str]:
+def random_play_faults(looks: Sequence[Mapping[str, float]]) -> list[str]:
     """A text for each fault of an environment that the signals of some looks at random play show."""
     lines = [{"step": i, **look} for i, look in enumerate(looks)]
     found = findings(Evidence({}, {}, {}, {}, lines, {}))

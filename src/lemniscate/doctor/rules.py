@@ -22,7 +22,7 @@ import numpy as np
 from lemniscate.doctor.evidence import HORIZONS, Evidence, first_number, last_number
 from lemniscate.run.fields import field_of, flag, typed
 from lemniscate.run.terms import ROUNDING
-from lemniscate.run.updates import OF_TARGETS
+from lemniscate.run.updates import TARGET_ROUNDING
 
 Seen = Iterator[tuple[str, str]]
 """names of faults, each with what was seen of it"""
@@ -161,7 +161,7 @@ def without_consequences(found: Sequence[tuple[Rule, str]]) -> list[tuple[Rule, 
     return [(rule, seen) for rule, seen in found if not CONSEQUENCES.get(rule.name, set()) & names]
 
 
-def of_observations(e: Evidence) -> Seen:
+def observation_faults(e: Evidence) -> Seen:
     """Faults of the observations, and of their copies in the replay buffer."""
     cut, repeated = e.late("observation/at_limits"), e.early("observation/repeated")
     predicted, whole, kept = map(e.late, ("observation/predicted", "observation/whole", "replay/repeated"))
@@ -195,7 +195,7 @@ def of_observations(e: Evidence) -> Seen:
             )
 
 
-def of_normalization(e: Evidence) -> Seen:
+def normalization_faults(e: Evidence) -> Seen:
     """Faults of the size of observations, and of the normalizer."""
     first, late = e.early("observation/largest"), e.late("observation/largest")
     offset = e.late("normalizer/offset")
@@ -221,7 +221,7 @@ def of_normalization(e: Evidence) -> Seen:
         )
 
 
-def of_actions(e: Evidence) -> Seen:
+def action_faults(e: Evidence) -> Seen:
     """Faults of the actions' effect, and of its delay."""
     effects, shares = e.values("action/effect"), e.values("action/share")
     now, beside = e.early("action/effect"), e.early("action/beside")
@@ -254,7 +254,7 @@ def of_actions(e: Evidence) -> Seen:
             yield "action-without-effect", f"Actions explain {max(0.0, explained):.2%} of how observations change."
 
 
-def of_parts_of_actions(e: Evidence) -> Seen:
+def action_part_faults(e: Evidence) -> Seen:
     """Faults of single numbers, signs and choices of actions, and of their bounds."""
     effects, at_bounds, by_sign = e.values("action/effect"), e.late("action/at_bounds"), e.early("action/by_sign")
     weakest, half, alike = map(e.values, ("action/weakest", "action/half", "action/alike"))
@@ -287,7 +287,7 @@ def of_parts_of_actions(e: Evidence) -> Seen:
         yield "actions-at-bounds", f"{at_bounds:.0%} of the actions lie at or beyond a bound."
 
 
-def of_reward_sizes(e: Evidence) -> Seen:
+def reward_size_faults(e: Evidence) -> Seen:
     """Faults of the size of rewards, and of those that are 0."""
     largest, scaled = e.greatest("reward/largest"), e.config.get("scale_rewards", False)
     zero, unpaid, ends = e.early("reward/zero"), e.late("reward/zero"), e.greatest("episode/terminated")
@@ -312,7 +312,7 @@ def of_reward_sizes(e: Evidence) -> Seen:
         yield "reward-large", f"Rewards reach {largest:,.3g}{'' if scaled else ', and are not scaled'}."
 
 
-def of_rewards(e: Evidence) -> Seen:
+def reward_faults(e: Evidence) -> Seen:
     """Faults of what the rewards depend on."""
     by_time, explained, before = e.late("reward/by_time"), e.values("reward/explained"), e.values("reward/before")
     std, by_age = e.late("reward/std"), e.late("reward/by_age")
@@ -340,7 +340,7 @@ def of_rewards(e: Evidence) -> Seen:
             )
 
 
-def of_episodes(e: Evidence) -> Seen:
+def episode_faults(e: Evidence) -> Seen:
     """Faults of the episodes: their starts, lengths and ends."""
     late, terminated = e.lengths[len(e.lengths) // 2 :], e.late("episode/terminated")
     short = len(e.lengths) >= 20 and np.percentile(e.lengths, 90) <= 2
@@ -376,13 +376,13 @@ def of_episodes(e: Evidence) -> Seen:
         )
 
 
-def of_resets(e: Evidence) -> Seen:
+def reset_faults(e: Evidence) -> Seen:
     """Whether a reset begins an episode anew."""
     if (share := e.median("observation/goes_on")) > 0.9 and not e.is_slow:
         yield "reset-without-effect", f"After {share:.0%} of the ends the next episode begins where the last one ended."
 
 
-def of_horizon(e: Evidence) -> Seen:
+def horizon_faults(e: Evidence) -> Seen:
     """Faults of the horizon: the discount against the length of episodes."""
     gamma, recommended = (first_number(config.get("gamma")) for config in (e.config, e.recommended))
     fifth = len(e.lengths) // 5
@@ -401,7 +401,7 @@ def of_horizon(e: Evidence) -> Seen:
             yield "ends-early", f"Returns rose while episodes went from {first:.0f} steps to {last:.0f}."
 
 
-def of_ratios(e: Evidence) -> Seen:
+def ratio_faults(e: Evidence) -> Seen:
     """Faults of the probability ratios: those of the KL divergence that no step explains, and their clip."""
     kl, other, rate = e.late("approx_kl"), e.late("old_approx_kl"), e.late("learning_rate")
     every, entropy, rates = e.values("approx_kl"), e.values("losses/entropy"), e.values("learning_rate")
@@ -436,7 +436,7 @@ def of_ratios(e: Evidence) -> Seen:
         yield "ratios-clipped", f"{clipped:.0%} of the late probability ratios are clipped."
 
 
-def of_updates(e: Evidence) -> Seen:
+def update_size_faults(e: Evidence) -> Seen:
     """Faults of the update's size."""
     kl = np.fmax(e.late("approx_kl"), e.late("kl"))
     target = next(filter(None, map(first_number, map(e.config.get, ("target_kl", "desired_kl", "max_kl")))), None)
@@ -455,7 +455,7 @@ def of_updates(e: Evidence) -> Seen:
         yield "policy-still", "The gradient of the policy is 0 in each of the late lines."
 
 
-def of_exploration(e: Evidence) -> Seen:
+def exploration_faults(e: Evidence) -> Seen:
     """Faults of exploration: the policy's spread, and random play."""
     first, late = e.early("policy_std"), e.late("policy_std")
     starts, total = e.config.get("learning_starts"), e.config.get("total_steps")
@@ -483,7 +483,7 @@ def of_exploration(e: Evidence) -> Seen:
         yield "mostly-random", f"The first {starts:,} of {total:,} steps are at random, without an update."
 
 
-def of_taken_actions(e: Evidence) -> Seen:
+def taken_action_faults(e: Evidence) -> Seen:
     """Faults of how far the actions that are taken lie from those of the policy."""
     away, tried = e.late("action/off_mode"), e.values("action/off_mode")
     never = len(tried) >= 3 and tried[:3].max() < 0.01 and not e.rose  # of a deterministic policy there is no more
@@ -496,7 +496,7 @@ def of_taken_actions(e: Evidence) -> Seen:
         yield "acts-at-mode", f"From the beginning on, actions lie within {tried[:3].max():.2g} of the policy's own."
 
 
-def of_entropies(e: Evidence) -> Seen:
+def entropy_faults(e: Evidence) -> Seen:
     """Faults of what is paid for the entropy."""
     entropy, temperature = e.values("losses/entropy"), e.values("temperature")
     weight, target = e.config.get("entropy_coef"), first_number(e.config.get("target_entropy"))
@@ -529,7 +529,7 @@ def of_entropies(e: Evidence) -> Seen:
             )
 
 
-def of_advantages(e: Evidence) -> Seen:
+def advantage_faults(e: Evidence) -> Seen:
     """Faults of the advantages, and of the value behind an end."""
     followed, ends = e.values("advantage/followed"), e.last_half("value/at_ends")
     often = len(ends) >= 2 and e.late("episode/terminated") > 0.9  # rare ends are learned late
@@ -594,7 +594,7 @@ def of_advantages(e: Evidence) -> Seen:
         )
 
 
-def of_batches(e: Evidence) -> Seen:
+def target_equation_faults(e: Evidence) -> Seen:
     """Whether targets follow from the rows of an update: equations that every healthy run fulfils."""
     if not _has_targets(e):
         return
@@ -602,7 +602,7 @@ def of_batches(e: Evidence) -> Seen:
     rest, beyond, missing, other = (e.median(f"targets/{name}") for name in names)
     if other > 0.01:
         yield "rows-of-others", f"In {other:.0%} of the rows of an update the action is not the one that was taken."
-    if rest > OF_TARGETS:
+    if rest > TARGET_ROUNDING:
         said = f"{min(100.0, 100 * rest):.2g} % of the targets' squares do not follow from the rows after them"
         yield "targets-differ", f"{said}; rounding leaves 1e-12."
     cut = "Where a time limit or a rollout's end cuts an episode, targets"
@@ -614,13 +614,13 @@ def of_batches(e: Evidence) -> Seen:
         yield "ends-continued", f"{beyond:.0%} of the squares of the targets at terminations are not the reward's."
 
 
-def of_parts_of_targets(e: Evidence) -> Seen:
+def target_part_faults(e: Evidence) -> Seen:
     """Faults of the rewards, γ, λ and entropies in the targets of V or Q, which are known to rounding."""
     names = ("discount", "trace", "other_rewards", "entropy")
     discount, trace, other, entropy = (e.median(f"targets/{name}", 2) for name in names)
     gamma, lam = (first_number(e.config.get(name)) for name in ("gamma", "gae_lambda"))
     lam = first_number(e.config.get("td_lambda")) if lam is None else lam
-    exact = not e.median("targets/unexplained") > OF_TARGETS or trace == trace
+    exact = not e.median("targets/unexplained") > TARGET_ROUNDING or trace == trace
     if other > ROUNDING:
         either = ", or returns are standardized" if lam == 1 or "returns" in e.config else ""  # then it is the same
         yield "rewards-differ", f"The rewards in the targets differ from those paid, by {other:.2g} of squares{either}."
@@ -640,7 +640,7 @@ def of_parts_of_targets(e: Evidence) -> Seen:
         yield name, f"In the targets of Q the entropy of the next action counts {entropy:.2g} times."
 
 
-def of_used_advantages(e: Evidence) -> Seen:
+def used_advantage_faults(e: Evidence) -> Seen:
     """Whether the advantages in a gradient step are those of its rows, and targets less values."""
     own, used = map(e.median, ("advantage/own", "advantage/used"))
     if not _has_targets(e):
@@ -677,8 +677,8 @@ MISTAKES = {
 """mistakes that `run/terms.py` tries where no term explains a gradient; each with its rule and what is seen"""
 
 
-def of_first_steps(e: Evidence) -> Seen:
-    """Faults of what the first gradient step of an update is given, and of its targets: exact, as `of_gradients`."""
+def first_step_faults(e: Evidence) -> Seen:
+    """Faults of what the first gradient step of an update is given, and of its targets: exact, as `gradient_faults`."""
     if (other := e.median("gradient/other_rows", 2)) > 0.01:
         yield "rows-of-others", f"{other:.0%} of the rows of a gradient step are not as they were collected."
     if (apart := e.median("gradient/old_policy", 2)) > 1e-3:
@@ -689,7 +689,7 @@ def of_first_steps(e: Evidence) -> Seen:
             yield name, f"To rounding, the gradient {what}."
 
 
-def of_gradients(e: Evidence) -> Seen:
+def gradient_faults(e: Evidence) -> Seen:
     """Whether the terms of the equations' loss explain the gradients: a healthy run's to rounding."""
     rests = {part: e.median(f"gradient/{part}_rest", 2) for part in ("policy", "value")}
     weights = {part: e.median(f"gradient/{part}", 2) for part in rests}
@@ -723,7 +723,7 @@ def of_gradients(e: Evidence) -> Seen:
         yield "entropy-opposed", f"The gradient lowers the entropy: that is {-np.median(entropy):.1%} of its length."
 
 
-def of_losses(e: Evidence) -> Seen:
+def loss_faults(e: Evidence) -> Seen:
     """The loss of V or Q, which is a square, beside half the mean squared error of its rows; and the learning rate."""
     losses = e.last_half("losses/value"), e.last_half("losses/critic")
     least = min((float(np.median(each)) for each in losses if len(each) >= 3), default=0.0)
@@ -747,7 +747,7 @@ def _standard_errors(values: np.ndarray) -> float:
     return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-9))
 
 
-def of_values(e: Evidence) -> Seen:
+def value_faults(e: Evidence) -> Seen:
     """Faults of V: bootstraps, explained variance, targets that feed on themselves."""
     missing = e.last_half("value/missing")
     own, of_gae = map(e.last_half, ("explained_variance", "value/explained"))
@@ -785,7 +785,7 @@ def of_values(e: Evidence) -> Seen:
         )
 
 
-def of_q(e: Evidence) -> Seen:
+def q_faults(e: Evidence) -> Seen:
     """Faults of Q(s, a): what it explains of its targets, of one step from replay, or of λ-returns."""
     by_steps, by_returns = "tau" in e.config, "final_epsilon" in e.config
     shares = e.last_half("value/explained" if by_steps else "explained_variance")
@@ -805,7 +805,7 @@ def _lacks_bootstrap(e: Evidence) -> bool:
     return len(missing) >= 2 and _is_missing(missing) and e.late("episode/terminated") < 0.5 and not climbs
 
 
-def of_replay(e: Evidence) -> Seen:
+def replay_faults(e: Evidence) -> Seen:
     """Faults of what stands in the replay buffer, and of what is drawn from it."""
     drawn, empty = e.last_half("replay/drawn"), e.median("replay/empty")
     if empty > 0.5:
@@ -828,7 +828,7 @@ def of_replay(e: Evidence) -> Seen:
             return
 
 
-def of_targets(e: Evidence) -> Seen:
+def target_faults(e: Evidence) -> Seen:
     """Faults of the targets of V and Q."""
     error, loss, newest = map(e.last_half, ("td_error/sampled", "losses/critic", "td_error/newest"))
     if len(newest) == len(error) >= 3:
@@ -860,7 +860,7 @@ def of_targets(e: Evidence) -> Seen:
         yield "q-opposed", f"V is {np.median(value):.3g}, and the rewards are {mean:.3g} on average: of the other sign."
 
 
-def of_what_stands_still(e: Evidence) -> Seen:
+def stillness_faults(e: Evidence) -> Seen:
     """Faults of what no update moves: V, Q, target networks."""
     moved, behind, length = map(e.values, ("value/moved", "targets/behind", "targets/length"))
     usual = all(map(e.as_recommended, ("tau", "policy_delay")))
@@ -890,7 +890,7 @@ def _is_missing(late: np.ndarray) -> bool:
     return bool(some and last.mean() >= 0.75 * first.mean())
 
 
-def of_networks(e: Evidence) -> Seen:
+def network_faults(e: Evidence) -> Seen:
     """Faults of the networks: their units and gradients."""
     inactive, saturated = e.late("network/inactive"), e.late("network/saturated")
     for field in ("hidden", "critic_hidden"):
@@ -919,7 +919,7 @@ def of_networks(e: Evidence) -> Seen:
         )
 
 
-def of_returns(e: Evidence) -> Seen:
+def return_faults(e: Evidence) -> Seen:
     """Faults of the returns over the whole run."""
     (first, last), fifth = e.ends, len(e.returns) // 5
     if e.gain < -5 and first.mean() - last.mean() > 0.25 * abs(first.mean()) and not e.begins:
@@ -947,7 +947,7 @@ def of_returns(e: Evidence) -> Seen:
         )
 
 
-def of_falls(e: Evidence) -> Seen:
+def fall_faults(e: Evidence) -> Seen:
     """A fall of the returns below their best."""
     window = max(10, len(e.returns) // 20)
     if len(e.returns) < 3 * window:
@@ -961,7 +961,7 @@ def of_falls(e: Evidence) -> Seen:
             yield "plasticity-lost", f"Inactive units rose from {first:.0%} to {late:.0%} while returns fell."
 
 
-def of_evaluations(e: Evidence) -> Seen:
+def evaluation_faults(e: Evidence) -> Seen:
     """Faults of the evaluation."""
     last, mean = e.ends[1], e.scores.get("mean_return", e.last("evaluation/return"))
     returns, each = e.scores.get("returns", ()), e.config.get("evaluate_episodes", 20)
@@ -994,36 +994,36 @@ def of_evaluations(e: Evidence) -> Seen:
 
 
 SUBJECTS = (
-    of_first_steps,  # first what is exact
-    of_gradients,
-    of_parts_of_targets,
-    of_batches,
-    of_used_advantages,
-    of_observations,
-    of_normalization,
-    of_actions,
-    of_parts_of_actions,
-    of_reward_sizes,
-    of_rewards,
-    of_episodes,
-    of_resets,
-    of_horizon,
-    of_ratios,
-    of_updates,
-    of_exploration,
-    of_taken_actions,
-    of_entropies,
-    of_advantages,
-    of_losses,
-    of_values,
-    of_q,
-    of_replay,
-    of_targets,
-    of_what_stands_still,
-    of_networks,
-    of_returns,
-    of_falls,
-    of_evaluations,
+    first_step_faults,  # first what is exact
+    gradient_faults,
+    target_part_faults,
+    target_equation_faults,
+    used_advantage_faults,
+    observation_faults,
+    normalization_faults,
+    action_faults,
+    action_part_faults,
+    reward_size_faults,
+    reward_faults,
+    episode_faults,
+    reset_faults,
+    horizon_faults,
+    ratio_faults,
+    update_size_faults,
+    exploration_faults,
+    taken_action_faults,
+    entropy_faults,
+    advantage_faults,
+    loss_faults,
+    value_faults,
+    q_faults,
+    replay_faults,
+    target_faults,
+    stillness_faults,
+    network_faults,
+    return_faults,
+    fall_faults,
+    evaluation_faults,
 )
 
 OF_RATIOS = {"rollout_rows": ("num_envs", "num_steps"), "replay_ratio": ("num_updates", "update_every", "num_envs")}

@@ -106,14 +106,14 @@ class Air:
             angle = jax.random.uniform(keys[0], (self.num_envs,), maxval=2 * jnp.pi)
             level = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=1)
             first = jax.random.normal(keys[1], (self.num_envs, 3))
-            air["wind"] = jnp.where(mask[:, None], self._of(air, "wind")[:, None] * level, air["wind"])
-            air["gust"] = jnp.where(mask[:, None], self._of(air, "gusts")[:, None] * first, air["gust"])
+            air["wind"] = jnp.where(mask[:, None], self._condition(air, "wind")[:, None] * level, air["wind"])
+            air["gust"] = jnp.where(mask[:, None], self._condition(air, "gusts")[:, None] * first, air["gust"])
         if self.is_blurred:
-            bias = self._of(air, "observation_bias")[:, None] * jax.random.normal(keys[2], (self.num_envs, 12))
+            bias = self._condition(air, "observation_bias")[:, None] * jax.random.normal(keys[2], (self.num_envs, 12))
             air["bias"] = jnp.where(mask[:, None], bias, air["bias"])
         return air
 
-    def _of(self, air: dict[str, Any], name: str) -> jax.Array:
+    def _condition(self, air: dict[str, Any], name: str) -> jax.Array:
         """The value of a condition, [N]."""
         return air["drawn"][name] if name in self.ranges else jnp.full(self.num_envs, CONDITIONS[name].nominal)
 
@@ -138,10 +138,10 @@ class Air:
         if not self.is_late:
             return air, lambda substep: command
         key, loss, jitter = jax.random.split(air["key"], 3)
-        lost = jax.random.uniform(loss, (self.num_envs,)) < self._of(air, "lost_actions")
+        lost = jax.random.uniform(loss, (self.num_envs,)) < self._condition(air, "lost_actions")
         commands = _push(air["commands"], jnp.where(lost[:, None], air["commands"][:, 0], command))
-        periods = self._of(air, "action_delay") * self.frequency
-        periods = periods + self._of(air, "jitter") * jax.random.uniform(jitter, (self.num_envs,))
+        periods = self._condition(air, "action_delay") * self.frequency
+        periods = periods + self._condition(air, "jitter") * jax.random.uniform(jitter, (self.num_envs,))
         delay = jnp.round(periods * self.substeps).astype(jnp.int32)
 
         def acting(substep: jax.Array) -> jax.Array:
@@ -156,12 +156,12 @@ class Air:
         key, own = jax.random.split(air["key"])
         keep = math.exp(-1 / (self.frequency * GUST_SECONDS))
         noise = math.sqrt(1 - keep**2) * jax.random.normal(own, (self.num_envs, 3))
-        gust = keep * air["gust"] + self._of(air, "gusts")[:, None] * noise
+        gust = keep * air["gust"] + self._condition(air, "gusts")[:, None] * noise
         return {**air, "key": key, "gust": gust}, air["wind"] + gust
 
     def steps_behind(self, air: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
         """The delay of observations as control steps and substeps, [N] each."""
-        behind = self._of(air, "observation_delay") * self.frequency * self.substeps
+        behind = self._condition(air, "observation_delay") * self.frequency * self.substeps
         return jnp.divmod(jnp.round(behind).astype(jnp.int32), self.substeps)
 
     def observe(self, air: dict[str, Any], state: jax.Array, action: jax.Array) -> dict[str, Any]:
@@ -204,7 +204,7 @@ class Air:
             key, own = jax.random.split(air["key"])
             age, _ = self.steps_behind(air)
             state = jnp.take_along_axis(air["states"], age[:, None, None], axis=1)[:, 0]
-            noise = self._of(air, "observation_noise")[:, None] * jax.random.normal(own, (self.num_envs, 12))
+            noise = self._condition(air, "observation_noise")[:, None] * jax.random.normal(own, (self.num_envs, 12))
             air, state = {**air, "key": key}, disturb(state, air["bias"] + noise)
         return {**air, "seen": jnp.where(mask, state, air["seen"])}
 

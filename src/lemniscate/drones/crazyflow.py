@@ -224,10 +224,10 @@ class CrazyflowBackend(JaxBackend):
 
     def _boxes(self, env: Any) -> np.ndarray:
         """The boxes of a `Scene`, of each drone's present episode."""
-        from lemniscate.drones.drones import by_turns
+        from lemniscate.drones.drones import interleaved
 
         each = self._state if isinstance(self._state, list) else [self._state]
-        return np.asarray(by_turns(*(env.boxes(arrays) for _, arrays, _ in each)))
+        return np.asarray(interleaved(*(env.boxes(arrays) for _, arrays, _ in each)))
 
     @classmethod
     def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneProbe:

@@ -238,20 +238,20 @@ class Mixed:
 
     def reset(self, state: State, mask: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
         """Reset the masked drones, as `Drones.reset`."""
-        return self._each(lambda one, its, begins: one.reset(its, begins, stagger), state, mask)
+        return self._call_each(lambda one, its, begins: one.reset(its, begins, stagger), state, mask)
 
     def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
         """One control step of every drone, as `Drones.step`."""
-        return self._each(Drones.step, state, action)
+        return self._call_each(Drones.step, state, action)
 
-    def _each(self, call: Callable, state: State, rows: jax.Array) -> tuple[Any, ...]:
+    def _call_each(self, call: Callable, state: State, rows: jax.Array) -> tuple[Any, ...]:
         """Call a function of each vector, of its state and of its rows; returns the states, and the rest as one."""
         parts = (rows[i :: len(self.drones)] for i in range(len(self.drones)))
         states, *others = zip(*map(call, self.drones, state, parts), strict=True)
-        return list(states), *(jax.tree.map(by_turns, *each) for each in others)
+        return list(states), *(jax.tree.map(interleaved, *each) for each in others)
 
 
-def by_turns(*parts: jax.Array) -> jax.Array:
+def interleaved(*parts: jax.Array) -> jax.Array:
     """The k arrays [N / k, …] as one [N, …], of which row i is from the array i mod k."""
     stacked = jnp.stack(parts, axis=1)
     return stacked.reshape(-1, *stacked.shape[2:])

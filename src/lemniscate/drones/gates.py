@@ -168,7 +168,7 @@ def out_of(matrix: jax.Array, vector: Any) -> jax.Array:
     return (matrix * vector[..., None, :]).sum(-1)
 
 
-def into(matrix: jax.Array, vector: Any) -> jax.Array:
+def to_frame(matrix: jax.Array, vector: Any) -> jax.Array:
     """Vectors [..., 3] of the world in a frame."""
     return (matrix * vector[..., :, None]).sum(-2)
 
@@ -205,7 +205,7 @@ def touches(centre: jax.Array, turned: jax.Array, low: np.ndarray, high: np.ndar
     way, half = centre - (low + high) / 2, (high - low) / 2
     size = jnp.abs(turned) + 1e-5  # across parallel edges there is no direction: it must not look like one with a gap
     along_box = jnp.abs(way) - half - (size * BODY).sum(-1)
-    along_body = jnp.abs(into(turned, way)) - BODY - (size * half[..., None]).sum(-2)
+    along_body = jnp.abs(to_frame(turned, way)) - BODY - (size * half[..., None]).sum(-2)
 
     roll_rows, roll_columns = partial(jnp.roll, axis=-2), partial(jnp.roll, axis=-1)
 
@@ -462,7 +462,7 @@ class DroneGates(DroneEnv):
         pos = states.pos[:, 0]
         self._crashed = self._touches(pos, Rotation.from_quat(states.quat[:, 0]).as_matrix()) | self._leaves(pos)
         place, turned = self._frame(self._target, self._gates)
-        before, now = (into(turned, at - place) for at in (self._before, pos))
+        before, now = (to_frame(turned, at - place) for at in (self._before, pos))
         passed = passes(before, now) & ~self._crashed
         progress = way_left(before) - jnp.where(passed, -jnp.linalg.norm(now, axis=-1), way_left(now))
         self._target = self._target + passed
@@ -509,7 +509,7 @@ class DroneGates(DroneEnv):
         """Whether the drone's box touches a gate's frame or stand, or an obstacle."""
         centre = pos + out_of(turned, BODY_CENTRE)
         frames = Rotation.from_euler("xyz", self._gates[..., 3:]).as_matrix()
-        local = into(frames, centre[:, None] - self._gates[..., :3])
+        local = to_frame(frames, centre[:, None] - self._gates[..., :3])
         own = (frames[..., None] * turned[:, None, :, None]).sum(-3)
         gates = touches(local[:, :, None], own[:, :, None], *_boxes(self.track.stand))
         obstacles = touches(centre[:, None] - self._obstacles, turned[:, None], *OBSTACLE)
@@ -522,7 +522,7 @@ class DroneGates(DroneEnv):
         known = jnp.where(self._gates_seen[..., None], self._gates, self._expected_gates)
         ahead = [self._frame(self._target + i, known) for i in (0, 1)]
         seen = [part for at, frame in ahead for part in (at - pos, frame[..., 0])]
-        parts["gates"] = jnp.concatenate([*seen, into(ahead[0][1], pos - ahead[0][0])], axis=1)
+        parts["gates"] = jnp.concatenate([*seen, to_frame(ahead[0][1], pos - ahead[0][0])], axis=1)
         obstacles = jnp.where(self._obstacles_seen[..., None], self._obstacles, self._expected_obstacles)
         far = jnp.full((n, 2, 2), 5.0)  # where there are fewer than two
         way = jnp.concatenate([obstacles[..., :2] - pos[:, None, :2], far], axis=1)

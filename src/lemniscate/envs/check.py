@@ -96,7 +96,7 @@ def each_finding(
         yield _raised(error, "It cannot be made")
         return
     try:
-        yield good(f"Served by {served_by}; observes {_seen(env.spec)}; acts by {_acts(env.spec.action)}.")
+        yield good(f"Served by {served_by}; observes {_observation_text(env.spec)}; acts by {_acts(env.spec.action)}.")
         yield good(RESETS[env.backend.mode.name])
         if cls.wraps(env_id):
             maker = maker_of(env_id)
@@ -122,10 +122,10 @@ def _one_line(message: object) -> str:
 
 def spaces_of(spec: Spec) -> tuple[str, str]:
     """The observation and the space of actions of an environment, as parts of a sentence."""
-    return _seen(spec), shown_space(action_space(spec.action))
+    return _observation_text(spec), shown_space(action_space(spec.action))
 
 
-def _seen(spec: Spec) -> str:
+def _observation_text(spec: Spec) -> str:
     seen, numbers = list[str](), list[ObservationPart]()
     for part in spec.observation_parts:
         if not part.image:

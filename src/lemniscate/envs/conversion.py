@@ -68,7 +68,7 @@ class SingleEnv(gym.Wrapper):
             raise self._returns.wrong("reset", f"made action_space {shown_space(now)}; {was}")
         two = type(returned) is tuple and len(returned) == 2
         usual = two and self._is_usual(returned[0], 0.0, False, False, returned[1])
-        obs, info = returned if usual else self._returns.of_reset(returned)
+        obs, info = returned if usual else self._returns.read_reset(returned)
         obs = obs.copy() if usual else obs  # several environments may write into one array
         return obs, self._reduced("reset", obs, info) if info or self._masked else info
 
@@ -80,13 +80,13 @@ class SingleEnv(gym.Wrapper):
             said = self._returns.explained("step", error)
             raise said from said.__cause__
         usual = type(returned) is tuple and len(returned) == 5 and self._is_usual(*returned)
-        obs, reward, terminated, truncated, info = returned if usual else self._returns.of_step(returned)
+        obs, reward, terminated, truncated, info = returned if usual else self._returns.read_step(returned)
         obs = obs.copy() if usual else obs  # as in reset
         info = self._reduced("step", obs, info) if info or self._masked else info
         return obs, reward, terminated, truncated, info
 
     def _is_usual(self, obs: Any, reward: Any, terminated: Any, truncated: Any, info: Any) -> bool:
-        """Whether each is of its type already, as mostly: this is asked at every step, and `of_step` is slower."""
+        """Whether each is of its type already, as mostly: this is asked at every step, and `read_step` is slower."""
         if type(obs) is not np.ndarray or obs.shape != self._shape or obs.dtype != self._dtype:
             return False
         flags = type(terminated) is bool and type(truncated) is bool
@@ -130,7 +130,7 @@ class SingleEnv(gym.Wrapper):
             return numbers
         name, mask = mask_in(obs, info)
         if mask is None and self._ask:
-            name, mask = MASKS[0], self._asked(*self._ask)
+            name, mask = MASKS[0], self._read_mask(*self._ask)
         if mask is not None or (name and isinstance(self.action_space, spaces.Discrete | spaces.MultiDiscrete)):
             try:
                 numbers["action_mask"] = flat_mask(mask, self.action_space)
@@ -138,7 +138,7 @@ class SingleEnv(gym.Wrapper):
                 raise self._returns.wrong(method, f"comes with an action mask {error}") from None
         return numbers
 
-    def _asked(self, layer: Any, name: str) -> Any:
+    def _read_mask(self, layer: Any, name: str) -> Any:
         """The mask that a method or an attribute of a layer gives."""
         try:
             mask = getattr(layer, name)

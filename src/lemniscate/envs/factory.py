@@ -105,11 +105,11 @@ def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs
     for wrap in wrappers:
         env = wrap(env)
     if not isinstance(env, gym.Env):
-        raise _other(env, "gymnasium.Env")
+        raise _wrong_kind(env, "gymnasium.Env")
     return SingleEnv(env)
 
 
-def _other(made: object, wanted: str) -> TypeError:
+def _wrong_kind(made: object, wanted: str) -> TypeError:
     """The words on something else than what is wanted."""
     instead = "; what speaks rsl_rl's VecEnv is of the backend rsl_rl" if hasattr(made, RSL_RL_METHOD) else ""
     if isinstance(made, gym.Env):
@@ -126,7 +126,7 @@ def make_vector(
         make = partial(gym.make_vec, maker) if isinstance(maker, EnvSpec) else maker
         made = make(num_envs=num_envs, **fresh(dict(kwargs)))
         if not isinstance(made, VectorEnv):
-            raise _other(made, "gymnasium.vector.VectorEnv")
+            raise _wrong_kind(made, "gymnasium.vector.VectorEnv")
         if made.num_envs != num_envs:
             kind = type(made).__name__
             raise UserError(

@@ -237,7 +237,7 @@ class GymnasiumBackend(Backend):
             next_obs[row, :size] = flatten_observation(self.spec.observation_parts, final, image=self.spec.image)
             name, mask = mask_in(final, final_info)
             if self._masks and mask is not None and final_info.get(f"_{name}", done)[row]:
-                next_obs[row, size:] = self._masks.of_row(row_of(mask, int(row)) if name else mask, int(row))
+                next_obs[row, size:] = self._masks.read_mask(row_of(mask, int(row)) if name else mask, int(row))
         return next_obs
 
     def _final(self, info: dict, row: int) -> Any:

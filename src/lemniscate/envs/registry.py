@@ -209,7 +209,7 @@ def file_name(env: str) -> str:
     return re.sub(r"[^\w.-]+", "_", env)
 
 
-def _made(cls: "type[Backend]", env: str, num_envs: int, device: Any, options: dict[str, Any]) -> "Backend":
+def _make_backend(cls: "type[Backend]", env: str, num_envs: int, device: Any, options: dict[str, Any]) -> "Backend":
     """A backend. Raises `UserError` where one of a user's own cannot be made so."""
     try:
         return cls(env, num_envs, device, **options)
@@ -281,7 +281,7 @@ def make(
     vectors = 1 if cls.divides(name) else len(world.held)
     once = cls.exists_once(name, int(number))
     options = {"stagger": stagger and not once, "kwargs": kwargs, "wrappers": wraps}
-    made = [_made(cls, name, mine // vectors, torch.device(device), options) for _ in range(vectors)]
+    made = [_make_backend(cls, name, mine // vectors, torch.device(device), options) for _ in range(vectors)]
     if wrong := [one.num_envs for one in made if one.num_envs != mine // vectors]:
         raise UserError(f"{chosen} has {wrong[0]} environments where it was to make {mine // vectors}.")
     made[0].once = once

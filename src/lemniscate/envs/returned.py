@@ -39,12 +39,12 @@ class ReturnedValues:
     def __init__(self, env: Any, space: gym.Space, lead: tuple[int, ...] = ()) -> None:
         self._env, self._space, self._lead = env, space, lead
 
-    def of_reset(self, returned: Any) -> tuple[Any, dict[str, Any]]:
+    def read_reset(self, returned: Any) -> tuple[Any, dict[str, Any]]:
         """The observation, in the types of its space, and the info."""
         obs, info = self._several("reset", returned, 2)
         return self._observation("reset", obs), self._info("reset", info)
 
-    def of_step(self, returned: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def read_step(self, returned: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """The observation, in the types of its space; the reward, the flags and the info."""
         obs, reward, terminated, truncated, info = self._several("step", returned, 5)
         reward = self._numbers("reward", reward, float)
@@ -113,7 +113,7 @@ class CheckedVector(VectorWrapper):
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Gymnasium's."""
         try:
-            return self._returns.of_reset(self.env.reset(seed=seed, options=options))
+            return self._returns.read_reset(self.env.reset(seed=seed, options=options))
         except (SystemExit, OSError) as error:
             said = self._returns.explained("reset", error)
             raise said from said.__cause__
@@ -121,7 +121,7 @@ class CheckedVector(VectorWrapper):
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Gymnasium's."""
         try:
-            return self._returns.of_step(self.env.step(actions))
+            return self._returns.read_step(self.env.step(actions))
         except (SystemExit, OSError) as error:
             said = self._returns.explained("step", error)
             raise said from said.__cause__

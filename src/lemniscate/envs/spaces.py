@@ -225,7 +225,7 @@ class ActionMasks:
         if name or mask is not None:
             given = np.asarray(info.get(f"_{name}", ~given))
             for row in np.flatnonzero(given):
-                masks[row] = self.of_row(None if mask is None else row_of(mask, int(row)), int(row))
+                masks[row] = self.read_mask(None if mask is None else row_of(mask, int(row)), int(row))
         self._masks[numbers], self._given[numbers] = masks, given
         return np.concatenate([flat, masks.astype(flat.dtype)], axis=-1)
 
@@ -241,7 +241,7 @@ class ActionMasks:
                 " of ones where all is permitted."
             )
 
-    def of_row(self, mask: Any, row: int) -> np.ndarray:
+    def read_mask(self, mask: Any, row: int) -> np.ndarray:
         """The mask that environment `row` gave as [n] bool. Raises `UserError` for another size."""
         try:
             return flat_mask(mask, self._spec.action)

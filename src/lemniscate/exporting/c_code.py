@@ -157,14 +157,14 @@ class Body:
         places = _places(x.shape)
         match operation.name:
             case "Reshape":
-                self._results[output] = self._seen(x, places.reshape(output.shape))
+                self._results[output] = self._reordered(x, places.reshape(output.shape))
             case "Expand":
-                self._results[output] = self._seen(x, np.broadcast_to(places, output.shape))
+                self._results[output] = self._reordered(x, np.broadcast_to(places, output.shape))
             case "Transpose":
-                self._results[output] = self._seen(x, places.transpose(settings["axes"]))
+                self._results[output] = self._reordered(x, places.transpose(settings["axes"]))
             case "Slice":
                 view = _part(places, settings["axis"], settings["start"], output.shape[settings["axis"]])
-                self._results[output] = self._seen(x, view)
+                self._results[output] = self._reordered(x, view)
             case "Linear":
                 self._linear(operation)
             case "Concat":
@@ -198,7 +198,7 @@ class Body:
         """A number of a result, as it stands in an array of floats."""
         return _bare(_cast(self._results[value].text, value.kind, "float"))
 
-    def _seen(self, operand: Operand, view: np.ndarray) -> Numbers:
+    def _reordered(self, operand: Operand, view: np.ndarray) -> Numbers:
         """The numbers of an operand in another order: those at the places in `view`."""
         if isinstance(operand, Value):
             numbers = self._results[operand]
@@ -221,7 +221,7 @@ class Body:
         for operand in operation.inputs:
             if isinstance(operand, Value) and operand.size < output.size:
                 self._array(operand)  # computed once for all numbers that need it, not in the loop
-        inputs = [self._seen(x, np.broadcast_to(_places(x.shape), output.shape)).text for x in operation.inputs]
+        inputs = [self._reordered(x, np.broadcast_to(_places(x.shape), output.shape)).text for x in operation.inputs]
         if operation.name == "Cast":
             (x,) = operation.inputs
             return Numbers(_cast(inputs[0], x.kind if isinstance(x, Value) else "float", output.kind))

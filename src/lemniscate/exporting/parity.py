@@ -164,7 +164,7 @@ def parity(
         compared = compared_with(host.act(obs), true)
         record["c_host"] = {**compared, **carries(host.act), "self_test": host.self_test(), "compiler": host.compiler}
         costs["c"] = nanoseconds(lambda: host.act(obs)) / len(obs)
-    record["c_cortex_m4f"], said = _on_target(program, files, obs, true, compared_with)
+    record["c_cortex_m4f"], said = _run_on_target(program, files, obs, true, compared_with)
     record["multiplications"] = program.multiplications
     record["ns_per_action"] = {name: cost and round(cost) for name, cost in costs.items()}
     record["ns_are"] = "C in a loop in C, the others called from Python with one observation, all on one core"
@@ -188,7 +188,7 @@ def compare(actions: np.ndarray, true: np.ndarray, units: np.ndarray, tolerance:
     }
 
 
-def _on_target(
+def _run_on_target(
     program: Program, files: Mapping[str, str], obs: np.ndarray, true: np.ndarray, compared_with: Callable[..., Any]
 ) -> tuple[dict[str, Any] | None, list[str]]:
     """The figures of a Cortex-M4F, and a sentence for what is not installed."""

@@ -49,7 +49,7 @@ class MultiCategorical:
 
     def sample(self, noise: Tensor) -> Tensor:
         """[B, K] int64, from noise [B, K] uniform in [0, 1)."""
-        return torch.stack([part.sample(column) for part, column in self._with(noise)], dim=-1)
+        return torch.stack([part.sample(column) for part, column in self._parts_with(noise)], dim=-1)
 
     def mode(self) -> Tensor:
         """[B, K] int64."""
@@ -57,7 +57,7 @@ class MultiCategorical:
 
     def log_prob(self, action: Tensor) -> Tensor:
         """[B]: Σ_k log π_k(a_k)."""
-        return torch.stack([part.log_prob(column) for part, column in self._with(action)]).sum(0)
+        return torch.stack([part.log_prob(column) for part, column in self._parts_with(action)]).sum(0)
 
     def entropy(self) -> Tensor:
         """[B]: Σ_k H[π_k]."""
@@ -67,7 +67,7 @@ class MultiCategorical:
         """[B]: Σ_k KL(π_k ‖ π'_k)."""
         return torch.stack([mine.kl(its) for mine, its in zip(self.parts, other.parts, strict=True)]).sum(0)
 
-    def _with(self, columns: Tensor) -> list[tuple[Categorical, Tensor]]:
+    def _parts_with(self, columns: Tensor) -> list[tuple[Categorical, Tensor]]:
         return list(zip(self.parts, columns.unbind(-1), strict=True))
 
 

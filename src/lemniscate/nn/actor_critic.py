@@ -94,8 +94,8 @@ class ActorCritic(nn.Module):
 
     def estimates(self, obs: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
         """V(s) and V(s') of rows [T, N, …], [T, N] each."""
-        value = by_chunks(self.value, obs)  # of rows, not of pieces
-        return value, of_next(self.value, value, obs, next_obs)
+        value = in_chunks(self.value, obs)  # of rows, not of pieces
+        return value, next_values(self.value, value, obs, next_obs)
 
     @torch.no_grad()
     def log_prob(self, obs: Tensor, action: Tensor) -> Tensor:
@@ -131,7 +131,7 @@ class ActionValues(nn.Module):
 
     def q(self, obs: Tensor, action: Tensor) -> Tensor:
         """Q(s, a) of rows […, O] and […], […]."""
-        return _taken(self.policy(obs).values, action)
+        return _values_taken(self.policy(obs).values, action)
 
     def value(self, obs: Tensor) -> Tensor:
         """max_a Q(s, a) of rows […, O], […]."""
@@ -140,23 +140,23 @@ class ActionValues(nn.Module):
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Q(s, a) and max_a Q(s', a) of rows [T, N, O], [T, N, O] and [T, N], [T, N] each."""
         values = self.policy(obs).values
-        return _taken(values, action), of_next(self.value, values.amax(-1), obs, next_obs)
+        return _values_taken(values, action), next_values(self.value, values.amax(-1), obs, next_obs)
 
 
-def _taken(values: Tensor, action: Tensor) -> Tensor:
+def _values_taken(values: Tensor, action: Tensor) -> Tensor:
     """Those of the actions taken, […], of Q(s, ·) […, n]."""
     return values.gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
 
-def by_chunks(function: Callable[[Tensor], Tensor], rows: Tensor) -> Tensor:
+def in_chunks(function: Callable[[Tensor], Tensor], rows: Tensor) -> Tensor:
     """A function of rows [T, N, …], a chunk of them at a time, [T, N]."""
     return torch.cat(list(map(function, rows.flatten(0, 1).split(CHUNK)))).view(rows.shape[:2])
 
 
-def of_next(function: Callable[[Tensor], Tensor], now: Tensor, obs: Tensor, next_obs: Tensor) -> Tensor:
+def next_values(function: Callable[[Tensor], Tensor], now: Tensor, obs: Tensor, next_obs: Tensor) -> Tensor:
     """A function at s' [T, N, …]: its value `now` [T, N] at the row after, where that begins with s'; else computed."""
     if torch.compiler.is_compiling():  # a program has one shape
-        return by_chunks(function, next_obs)
+        return in_chunks(function, next_obs)
     others = torch.ones_like(now, dtype=torch.bool)
     others[:-1] = (next_obs[:-1] != obs[1:]).any(-1)
     after = now.roll(-1, 0)

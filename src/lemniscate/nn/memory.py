@@ -151,7 +151,7 @@ class OwnCell(OwnNetwork):
             rows.append(row)
         return torch.stack(rows, dim=1)
 
-    def _taken(self, inputs: int, outputs: int) -> str:
+    def _expected_shapes(self, inputs: int, outputs: int) -> str:
         return f"[B, {inputs}] and memory_size numbers, [B, K], to [B, {outputs}] and the next [B, K]"
 
     def _call(self, rows: Tensor) -> Tensor:

@@ -139,9 +139,9 @@ class OwnNetwork(nn.Module):
         super().__init__()
         self.name, self.writes = name, False
         rows = torch.randn(64, inputs, generator=torch.Generator().manual_seed(0))
-        wanted = f"{name}({inputs}, {outputs}) must make a module that takes {self._taken(inputs, outputs)}"
+        wanted = f"{name}({inputs}, {outputs}) must make a module that takes {self._expected_shapes(inputs, outputs)}"
         try:
-            self.module = self._made(inputs, outputs)
+            self.module = self._make(inputs, outputs)
             before, given = self._tensors(), rows.clone()
             with torch.enable_grad():
                 out = self._call(given)
@@ -167,7 +167,7 @@ class OwnNetwork(nn.Module):
         self._require_rows(out, rows)
         self._require_saved(out, rows)
 
-    def _made(self, inputs: int, outputs: int) -> Any:
+    def _make(self, inputs: int, outputs: int) -> Any:
         """A new module. Raises `UserError` for one that is made already, or says too late that it has a memory."""
         maker = find_callable(self.name)
         if isinstance(maker, nn.Module):
@@ -225,7 +225,7 @@ class OwnNetwork(nn.Module):
         module = self.module
         try:
             with torch.random.fork_rng([]), torch.no_grad():
-                self.module = self._made(rows.shape[-1], out.shape[-1])
+                self.module = self._make(rows.shape[-1], out.shape[-1])
                 self._call(rows)  # where its layers find out their sizes
                 self.module.load_state_dict(module.state_dict())
                 again, self.module = self._call(rows), module
@@ -239,7 +239,7 @@ class OwnNetwork(nn.Module):
                 " layers must be attributes or in an nn.ModuleList, and tensors given to register_buffer."
             )
 
-    def _taken(self, inputs: int, outputs: int) -> str:
+    def _expected_shapes(self, inputs: int, outputs: int) -> str:
         """The shapes that the module is to take and return, in words."""
         return f"[B, {inputs}] to [B, {outputs}]"
 

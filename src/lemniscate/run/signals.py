@@ -15,11 +15,11 @@ from torch.nn.functional import one_hot
 
 from lemniscate.data.replay import ReplayBuffer
 from lemniscate.maths import explained_by, explained_by_each, explained_variance, moments, td_target
-from lemniscate.nn.actor_critic import of_next
+from lemniscate.nn.actor_critic import next_values
 from lemniscate.nn.networks import ACTIVATIONS
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.run.config import RunConfig
-from lemniscate.run.updates import Watched, of_batch, of_update, old_value_of, spread
+from lemniscate.run.updates import Watched, batch_signals, old_value_of, spread, update_signals
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 from lemniscate.types import Rollout, Transition
 
@@ -68,11 +68,12 @@ def signals(
     chosen, scaled = _valid(rows), rows
     if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
         scaled = replace(rows, reward=state.reward_scale(rows.reward))
-    found = of_networks(state, chosen) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
-    found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled), watched)
+    found = network_signals(state, chosen) | value_signals(state, config, scaled)
+    found |= update_signals(state, config, scaled, acted) | replay_signals(state, rows)
+    found |= critic_signals(state, config, _valid(scaled), watched)
     if watched:
-        found |= of_batch(config, watched.given, scaled, old_value_of(state, acted)) | watched.found
-    return of_environment(rows, spec, ages) | {name: float(value) for name, value in found.items()}
+        found |= batch_signals(config, watched.given, scaled, old_value_of(state, acted)) | watched.found
+    return environment_signals(rows, spec, ages) | {name: float(value) for name, value in found.items()}
 
 
 def _valid(rows: Rollout) -> Rollout:
@@ -80,14 +81,14 @@ def _valid(rows: Rollout) -> Rollout:
     return rows.flatten() if rows.valid.all() else rows[rows.valid]
 
 
-def of_environment(rows: Rollout, spec: Spec, ages: Tensor | None = None) -> dict[str, float]:
+def environment_signals(rows: Rollout, spec: Spec, ages: Tensor | None = None) -> dict[str, float]:
     """The signals of rows [T, N, …] alone, two of which are valid at least; with `ages` [N] as in `signals`."""
-    found = of_rows(_valid(rows), spec) | of_time(rows) | of_starts(rows, spec)
+    found = row_signals(_valid(rows), spec) | time_signals(rows) | start_signals(rows, spec)
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
         few = slice(max(2, MOST_ROWS // len(rows.done)))  # of the environments
         rows = rows[:, few]
-        found |= of_effects(_valid(rows), spec)
-        found |= of_ages(rows, spec, ages[few], found) if ages is not None else {}
+        found |= effect_signals(_valid(rows), spec)
+        found |= age_signals(rows, spec, ages[few], found) if ages is not None else {}
         if found["reward/explained"] < 0.8 and found["reward/std"] > 0:  # else no other row has more to explain
             found["reward/before"] = paid_before(rows, spec, found["reward/explained"])
         if found["action/effect"] < 0.2:
@@ -95,7 +96,7 @@ def of_environment(rows: Rollout, spec: Spec, ages: Tensor | None = None) -> dic
     return {name: float(value) for name, value in found.items()}
 
 
-def of_rows(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
+def row_signals(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     """Sizes of rewards and observations, and shares of rows [B, …].
 
     The shares are of rewards that are 0, of numbers that never change, of observations that are as the one before, of
@@ -124,7 +125,7 @@ def of_rows(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     return found | ({"episode/terminated": rows.terminated.sum() / ends} if ends else {})
 
 
-def of_starts(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
+def start_signals(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     """Whether episodes begin alike, and where the ones before have ended, of rows [T, N, …] with three beginnings.
 
     The second is the share of the ends, where one row follows the other, after which the observation is as far from the
@@ -142,7 +143,7 @@ def of_starts(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     return found
 
 
-def of_time(rows: Rollout) -> dict[str, Tensor]:
+def time_signals(rows: Rollout) -> dict[str, Tensor]:
     """The share of the rewards' variance that is within episodes, and of that what a line over time explains.
 
     Of rows [T, N, …]; both are 0 for rewards that never change.
@@ -162,7 +163,7 @@ def of_time(rows: Rollout) -> dict[str, Tensor]:
     return {"reward/by_time": by_time, "reward/within": reward.square().sum() / varies}
 
 
-def of_ages(rows: Rollout, spec: Spec, ages: Tensor, known: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def age_signals(rows: Rollout, spec: Spec, ages: Tensor, known: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """What recurs at the same steps of episodes, of rows [T, N, …] whose environments have had `ages` [N] steps since.
 
     - reward/by_age: the share of the rewards' variance that a line over the steps since an episode's beginning explains
@@ -199,7 +200,7 @@ def _jumps(rows: Rollout, spec: Spec) -> Tensor:
     return (change > (10 * change.median()).clamp(min=0.5)) & ~rows.done & rows.valid
 
 
-def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
+def effect_signals(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     """How actions, observations and rewards depend on each other, by linear regression (`explained_by`).
 
     - action/effect: the share of the observations' change that actions explain beyond the observations, where most.
@@ -339,7 +340,7 @@ def _numbers(action: Tensor, kind: Action) -> Tensor:
     return action.double()
 
 
-def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
+def network_signals(state: Any, rows: Rollout) -> dict[str, Tensor]:
     """Of the policy: shares of units that never change, are at ±1, and are alike; its rank, its normalizer's state.
 
     Inactive is a unit whose standard deviation over rows is below a fortieth of its layer's mean, as the dormant units
@@ -356,7 +357,7 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
             hook.remove()
     found = dict[str, Tensor]()
     if hasattr(distribution, "sample"):  # a policy of one's own may say something else
-        found |= _off_mode(state.policy, distribution, obs, rows.action[-SEEN:])
+        found |= _distance_from_mode(state.policy, distribution, obs, rows.action[-SEEN:])
     if units := [layer.flatten(1).float() for layer in layers if layer.ndim > 1 and len(layer) == len(obs)]:
         stds = [spread(layer) for layer in units]
         inactive = [std < (std.mean() / 40).clamp(min=1e-3) for std in stds]
@@ -374,7 +375,7 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
     return found
 
 
-def _off_mode(policy: Any, distribution: Any, obs: Tensor, action: Tensor) -> dict[str, Tensor]:
+def _distance_from_mode(policy: Any, distribution: Any, obs: Tensor, action: Tensor) -> dict[str, Tensor]:
     """The distance of actions from the policy's mode over that of actions drawn from it.
 
     Of a deterministic policy it is the distance itself, in units of half the action range. Nothing where so few choices
@@ -387,7 +388,7 @@ def _off_mode(policy: Any, distribution: Any, obs: Tensor, action: Tensor) -> di
     return {"action/off_mode": away / usual} if action.is_floating_point() or usual > 0.2 else {}
 
 
-def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
+def value_signals(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
     """Of V, from rows [T, N, …], for algorithms with a V(s); of Q(s, ·) it is the largest. value/mean is its mean.
 
     - value/missing: the mean of r + γ V(s') − V(s) over (1 − γ) |V|, above 0 where V is too small. That mean is 1 − γ
@@ -400,7 +401,7 @@ def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]
     if not hasattr(state.networks, "value"):
         return {}
     value = state.networks.value(rows.obs.flatten(0, 1)).view(valid.shape)  # of rows, not of pieces
-    after = of_next(state.networks.value, value, rows.obs, rows.next_obs)
+    after = next_values(state.networks.value, value, rows.obs, rows.next_obs)
     chosen, value, after = rows[valid], value[valid], after[valid]
     found["value/mean"] = value.mean()
     if gamma < 1:
@@ -410,7 +411,7 @@ def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]
     return found
 
 
-def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
+def replay_signals(state: Any, rows: Rollout) -> dict[str, Tensor]:
     """The shares of the ends, and of the last, of the newest rows [T, N, …] that the replay buffer has otherwise.
 
     They are found there by their observation.
@@ -430,14 +431,14 @@ def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
     column = int(spread(given.obs.float()).argmax())  # an image has bytes
     pairs = (given.obs[:, column, None] == stored.obs[:, column]).nonzero()
     row, place = pairs[(given.obs[pairs[:, 0]] == stored.obs[pairs[:, 1]]).all(1)].unbind(1)
-    of_row, of_place = given[row], stored[place]
+    new, kept = given[row], stored[place]
     found, every = dict[str, Tensor](), torch.ones_like(given.done)
     for name, agrees, which in (
-        ("actions", (of_row.action - of_place.action).abs().amax(-1) < 1e-5, every),
-        ("next", (of_row.next_obs == of_place.next_obs).all(-1), every),
-        ("signs", of_row.reward.sign() == of_place.reward.sign(), every),
-        ("ends", of_place.terminated, given.terminated),
-        ("limits", ~of_place.terminated, given.truncated & ~given.terminated),
+        ("actions", (new.action - kept.action).abs().amax(-1) < 1e-5, every),
+        ("next", (new.next_obs == kept.next_obs).all(-1), every),
+        ("signs", new.reward.sign() == kept.reward.sign(), every),
+        ("ends", kept.terminated, given.terminated),
+        ("limits", ~kept.terminated, given.truncated & ~given.terminated),
     ):
         there = which[row]
         known, right = (set(row[each].tolist()) for each in (there, there & agrees))
@@ -446,7 +447,7 @@ def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
     return found
 
 
-def of_critics(state: Any, config: RunConfig, rows: Rollout, watched: Watched | None = None) -> dict[str, Tensor]:
+def critic_signals(state: Any, config: RunConfig, rows: Rollout, watched: Watched | None = None) -> dict[str, Tensor]:
     """The mean squared error of Q over one step, of the newest rows and of sampled ones, and the share that is missing.
 
     For algorithms that learn Q(s, a) of continuous actions; those that have no replay sample the newest rows. Also what

@@ -26,7 +26,7 @@ MOST_PARAMETERS = 5_000_000
 """beyond which gradients are not taken apart, of which each term has a copy in float64"""
 
 
-def of_gradient(
+def gradient_signals(
     config: RunConfig, state: Any, optimizer: Adam, gradient: Tensor, args: tuple[Any, ...]
 ) -> dict[str, Tensor]:
     """What a gradient [P] is made of: the gradients of the terms in the equations' loss, by least squares.
@@ -40,7 +40,7 @@ def of_gradient(
     if len(gradient) > MOST_PARAMETERS or any(isinstance(m, Bfloat16Linear) for m in optimizer.networks.modules()):
         return found  # whose rounding is no share of 1e-12
     with torch.enable_grad():
-        terms = terms_of(config, state, optimizer.networks, *args)
+        terms = loss_terms(config, state, optimizer.networks, *args)
         slopes = {
             name: torch.autograd.grad(term, parameters, retain_graph=True, allow_unused=True, materialize_grads=True)
             for name, term in terms.items()
@@ -72,14 +72,14 @@ def _stands_alone(columns: Tensor, k: int, whole: Tensor) -> bool:
     return bool(columns[:, k].norm() > 1e-5 * whole.norm() and (alike > 0.999).sum() == 1)
 
 
-def terms_of(config: Any, state: Any, networks: Any, batch: Any, *noise: Tensor) -> dict[str, Tensor]:
+def loss_terms(config: Any, state: Any, networks: Any, batch: Any, *noise: Tensor) -> dict[str, Tensor]:
     """The terms of the equations' loss for networks and rows [M, …], scalars to descend; none where it is unknown.
 
     "policy" judges actions, "value" V or Q, "entropy" is that of the policy with a minus, "kl" what holds it back, and
     "baseline" what a mean of the advantages does. Not known are TRPO's surrogate, temperatures and multipliers.
     """
     if isinstance(batch, Batch):
-        return _of_advantages(config, networks, batch)
+        return _advantage_terms(config, networks, batch)
     if isinstance(batch, SoftBatch) and isinstance(networks, Policy):
         distribution = networks(batch.obs)
         action, log_prob = distribution.sample_with_log_prob(*noise)
@@ -109,7 +109,7 @@ def terms_of(config: Any, state: Any, networks: Any, batch: Any, *noise: Tensor)
     return {}
 
 
-def _of_advantages(config: Any, networks: Any, batch: Batch) -> dict[str, Tensor]:
+def _advantage_terms(config: Any, networks: Any, batch: Batch) -> dict[str, Tensor]:
     """The terms of a policy that follows the advantages of rows [M, …], and of the V(s) beside it, if there is one."""
     of_both = networks(batch.obs)
     distribution, value = of_both if isinstance(networks, ActorCritic) else (of_both, of_both)
@@ -159,7 +159,7 @@ class Online(NamedTuple):
     follows: bool
 
 
-def of_mistakes(
+def mistake_signals(
     config: RunConfig, state: Any, optimizer: Adam, gradient: Tensor, before: Tensor, args: tuple[Any, ...]
 ) -> dict[str, Tensor]:
     """The share of a gradient's squares that no term explains if a well-known mistake was made: "gradient/if_…".
@@ -175,15 +175,15 @@ def of_mistakes(
     - no_clip, largest_clip: no ratio is clipped, or the larger of r A and clip(r) A is taken.
     - not_zeroed: the gradient [P] is added to the one `before`, [P].
 
-    Also what `of_targets` finds.
+    Also what `target_signals` finds.
     """
     batch, *noise = args
-    parts = of_gradient(config, state, optimizer, gradient, args)
+    parts = gradient_signals(config, state, optimizer, gradient, args)
     left: dict[str, list[dict[str, Tensor]]] = {}
     if len(before) == len(gradient) and before.any():
-        left["not_zeroed"] = [of_gradient(config, state, optimizer, gradient - before, args)]
+        left["not_zeroed"] = [gradient_signals(config, state, optimizer, gradient - before, args)]
     for name, its_config, its_state, rows in _mistaken(config, state, batch):
-        left.setdefault(name, []).append(of_gradient(its_config, its_state, optimizer, gradient, (rows, *noise)))
+        left.setdefault(name, []).append(gradient_signals(its_config, its_state, optimizer, gradient, (rows, *noise)))
     rests, one = [name for name in parts if name.endswith("_rest")], torch.ones((), dtype=torch.float64)
     found = {
         f"gradient/if_{name}": torch.stack(
@@ -192,7 +192,7 @@ def of_mistakes(
         for name, variants in left.items()
     }
     if "gradient/value_rest" in parts:
-        found |= of_targets(config, state, optimizer, gradient, args)
+        found |= target_signals(config, state, optimizer, gradient, args)
     return found
 
 
@@ -245,10 +245,12 @@ class Judged(NamedTuple):
         return self.judge(self.critics(obs, action))[None]
 
 
-def of_targets(config: Any, state: Any, optimizer: Adam, gradient: Tensor, args: tuple[Any, ...]) -> dict[str, Tensor]:
+def target_signals(
+    config: Any, state: Any, optimizer: Adam, gradient: Tensor, args: tuple[Any, ...]
+) -> dict[str, Tensor]:
     """What differs in the targets of V or Q, by the gradient [P] that they make, where that is one thing alone.
 
-    - targets/other_rewards, targets/discount: as of `updates.of_recursion`, of Q(s, a) of continuous actions.
+    - targets/other_rewards, targets/discount: as of `updates.recursion_signals`, of Q(s, a) of continuous actions.
     - targets/entropy: how often the entropy of the next action counts there.
     - targets/rescaled: the difference of a y + b, which stands there for y, from y, as a share of its squares; of V and
       of Q(s, ·).

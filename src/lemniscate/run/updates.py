@@ -16,17 +16,17 @@ from torch.func import functional_call
 
 from lemniscate.data.rollout import QBatch, SoftBatch
 from lemniscate.maths import explained_variance, gae
-from lemniscate.nn.actor_critic import ActorCritic, of_next
+from lemniscate.nn.actor_critic import ActorCritic, next_values
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, LossFunction
 from lemniscate.optim.compiled import Learner
 from lemniscate.run.config import RunConfig
-from lemniscate.run.terms import ROUNDING, difference, fitted, of_gradient, of_mistakes
+from lemniscate.run.terms import ROUNDING, difference, fitted, gradient_signals, mistake_signals
 from lemniscate.types import Batch, DrawnBatch, Metrics, Rollout, wide_float
 
 Given = tuple[Any, tuple[Tensor, ...], bool]
 """what the gradient steps of an update were given: see `Watched.given`"""
-OF_TARGETS = 1e-8
+TARGET_ROUNDING = 1e-8
 """the share of the squares of targets above which what does not follow cannot be rounding; healthy runs have 1e-12"""
 MOST_CALLS = 8
 """calls of `learn` in which the first gradient of each optimizer is waited for; some are stepped elsewhere"""
@@ -43,9 +43,9 @@ def acted_with(state: Any) -> dict[str, Tensor]:
 class Watched:
     """The gradient steps of an algorithm, in an update that is looked at: what the first call was given is kept.
 
-    In a close look, which has a number, `found` has the signals of the first gradient of each optimizer: `of_gradient`.
-    In every second one it is the first gradient of the second call: before the policy has moved, neither a clip nor a
-    bound on the KL divergence does anything.
+    In a close look, which has a number, `found` has the signals of the first gradient of each optimizer
+    (`gradient_signals`). In every second one it is the first gradient of the second call: before the policy has moved,
+    neither a clip nor a bound on the KL divergence does anything.
     """
 
     def __init__(self, state: Any, close: int | None = None) -> None:
@@ -63,7 +63,7 @@ class Watched:
         self._calls += 1
         data, *by_step = args[2:] or (None,)
         if not self._given and len(args) > 2:
-            self._given = self._with_values(data) if type(data) is QBatch else data, *by_step
+            self._given = self._add_values(data) if type(data) is QBatch else data, *by_step
             self.stored = len(self._state.replay) if hasattr(self._state, "replay") else 0
         if not self._unseen or self._calls > MOST_CALLS or (self._calls == 1 and self._is_later(data)):
             return self._learn(*args, **flags)
@@ -83,7 +83,7 @@ class Watched:
         """Whether a later gradient than the first of this data is looked at."""
         return (self._close or 0) % 2 == 1 and isinstance(data, DrawnBatch | SoftBatch)
 
-    def _with_values(self, data: Any) -> Any:
+    def _add_values(self, data: Any) -> Any:
         """The data [B, …] of Q, with max_a Q(s, a) [B] of the networks before this update as `value`."""
         with suppress(Exception), torch.no_grad():  # networks of one's own may have no such thing
             return replace(data, value=self._state.networks.value(data.obs)) if self._close is not None else None
@@ -115,16 +115,16 @@ class Watched:
         # A loss of one's own may be given anything: then nothing is said of it.
         with suppress(Exception), torch.no_grad():
             if is_first and not is_later:
-                self.found |= of_minibatch(self._now[2], self._now[3][0], args[0])
+                self.found |= minibatch_signals(self._now[2], self._now[3][0], args[0])
         with suppress(Exception), torch.no_grad():
-            self.found |= {} if is_later else of_old_policy(optimizer.networks, args[0])
+            self.found |= {} if is_later else old_policy_signals(optimizer.networks, args[0])
         with suppress(Exception):
             of_it = self._now[0], self._state, optimizer, gradient
-            found = of_gradient(*of_it, args)
+            found = gradient_signals(*of_it, args)
             rest = max(share for name, share in found.items() if name.endswith("_rest"))
             self.found |= {"gradient/later_rest": rest} if is_later else found
             if rest > ROUNDING:
-                self.found |= of_mistakes(*of_it, before, args)
+                self.found |= mistake_signals(*of_it, before, args)
         return gradient, metrics
 
     @property
@@ -145,7 +145,9 @@ def spread(x: Tensor) -> Tensor:
     return (x - x.mean(0)).square().mean(0).sqrt()  # `Tensor.std` takes five times as long
 
 
-def of_update(state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
+def update_signals(
+    state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None
+) -> dict[str, Tensor]:
     """Of the newest update, from rows [T, N, …] and the networks before it, for algorithms with a V(s).
 
     - network/moved and value/moved: how far the parameters of the policy and of V moved, as a share of their length.
@@ -163,11 +165,11 @@ def of_update(state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, 
     if not (old_value := old_value_of(state, acted)):  # but the largest of Q
         return found
     before = {key.removeprefix(PARTS[0]): x for key, x in acted.items() if key.startswith(PARTS[0])}
-    old = partial(_of_old, state.policy, before)
+    old = partial(_call_with, state.policy, before)
     rows = rows[-getattr(config, "num_steps", len(rows.done)) :]  # REINFORCE collects whole episodes
     obs, action, done, newest = rows.obs.flatten(0, 1), rows.action.flatten(0, 1), rows.done, rows.valid
     value, gamma = old_value(obs).view(done.shape), getattr(config, "gamma", 1.0)
-    next_value = of_next(old_value, value, rows.obs, rows.next_obs)
+    next_value = next_values(old_value, value, rows.obs, rows.next_obs)
     advantage, target = gae(rows.reward, value, next_value, rows.terminated, done, gamma=gamma, lam=0.95)
     now = state.policy(obs)
     if not hasattr(now, "log_prob"):  # of a squashed or a deterministic policy there is none
@@ -186,16 +188,16 @@ def old_value_of(state: Any, acted: Mapping[str, Tensor] | None) -> Callable[[Te
     if acted is None or not isinstance(value, nn.Module):
         return None
     return partial(
-        _of_old, value, {key.removeprefix(PARTS[1]): x for key, x in acted.items() if key.startswith(PARTS[1])}
+        _call_with, value, {key.removeprefix(PARTS[1]): x for key, x in acted.items() if key.startswith(PARTS[1])}
     )
 
 
-def _of_old(module: nn.Module, tensors: Mapping[str, Tensor], obs: Tensor) -> Any:
+def _call_with(module: nn.Module, tensors: Mapping[str, Tensor], obs: Tensor) -> Any:
     """What a module says with other parameters and buffers."""
     return functional_call(module, dict(tensors), (obs,), tie_weights=False)
 
 
-def of_batch(
+def batch_signals(
     config: RunConfig, given: Given, rows: Rollout, old_value: Callable[[Tensor], Tensor] | None = None
 ) -> dict[str, Tensor]:
     """Of the rows that an update learned from, where they are the newest, [T, N, …]: whether they follow from these.
@@ -205,9 +207,9 @@ def of_batch(
     - advantage/used: that of the advantages in the first gradient step with those of its rows.
     - value/loss: half the mean of the squared differences of values and targets, in an update of one gradient step.
     - targets/other_actions: the share of the rows whose action is not the one that was taken.
-    - targets/missing: see `of_cuts`; where V before the update, `old_value`, is known.
+    - targets/missing: see `cut_signals`; where V before the update, `old_value`, is known.
 
-    Also what `of_recursion` finds. Of PQN the value is the largest Q(s, ·), and there are no advantages.
+    Also what `recursion_signals` finds. Of PQN the value is the largest Q(s, ·), and there are no advantages.
     """
     data, by_step, is_one = given
     columns, found = _columns_of(config, data, rows), dict[str, Tensor]()
@@ -218,11 +220,11 @@ def of_batch(
     if data.action.dtype == newest.action.dtype and data.action.shape[1:] == newest.action.shape[2:]:
         other = data.action.reshape(-1, *newest.action.shape[1:])[-steps:] != newest.action
         found["targets/other_actions"] = other.reshape(*g.shape, -1).any(-1)[newest.valid].float().mean()
-    found |= of_recursion(config, newest, v, g)
+    found |= recursion_signals(config, newest, v, g)
     beyond, size, ends = g - newest.reward.to(g.dtype), g.square().mean(), newest.terminated & newest.valid
     if size > 0 and ends.any():
         found["targets/beyond_ends"] = beyond[ends].square().mean() / size
-    found |= of_cuts(config, newest, g, old_value) if old_value else {}
+    found |= cut_signals(config, newest, g, old_value) if old_value else {}
     pairs = {"advantage/own": (a[0][newest.valid], (g - v)[newest.valid])} if a else {}
     if by_step and a:
         value, target, advantage = (x.flatten()[by_step[0][0].flatten()] for x in columns)
@@ -235,7 +237,7 @@ def of_batch(
     return found
 
 
-def of_recursion(config: RunConfig, rows: Rollout, value: Tensor, target: Tensor) -> dict[str, Tensor]:
+def recursion_signals(config: RunConfig, rows: Rollout, value: Tensor, target: Tensor) -> dict[str, Tensor]:
     """How the targets [T, N] of rows follow from their rewards, and from the values and targets of the rows after.
 
     - targets/discount: the factor by which they follow from those, which λ mixes.
@@ -257,7 +259,7 @@ def of_recursion(config: RunConfig, rows: Rollout, value: Tensor, target: Tensor
         return {}
     discount = (ahead * rest).sum() / ahead.square().sum()
     found = {"targets/discount": discount, "targets/unexplained": (rest - discount * ahead).square().mean() / size}
-    if found["targets/unexplained"] <= OF_TARGETS:
+    if found["targets/unexplained"] <= TARGET_ROUNDING:
         return found
     v, g, r, on = (x.cpu().double() for x in (value, target, rows.reward, on))
     one, on, gamma = torch.ones_like(g), on.bool(), getattr(config, "gamma", 1.0)
@@ -265,25 +267,25 @@ def of_recursion(config: RunConfig, rows: Rollout, value: Tensor, target: Tensor
     weights, left = fitted(torch.stack([x[on] for x in after], 1), g[:-1][on])
     if v[1:][on].std() < 1e-3 * g[1:][on].std():  # then no fit knows what V counts
         return found
-    if left < OF_TARGETS / 10:
-        a, b, own, of_next, chain = weights.tolist()
-        right = [abs(x - y) < 1e-3 for x, y in ((of_next, gamma * (1 - lam)), (chain, gamma * lam))]
+    if left < TARGET_ROUNDING / 10:
+        a, b, own, next_weight, chain = weights.tolist()
+        right = [abs(x - y) < 1e-3 for x, y in ((next_weight, gamma * (1 - lam)), (chain, gamma * lam))]
         if abs(own + 1) < 1e-3:
             return found | {"targets/less_values": torch.ones(())}
         if all(right):
             return found | {"targets/other_rewards": difference(a * r[:-1][on] + b, r[:-1][on])}
-        if abs(of_next + chain - gamma) < 1e-3:
+        if abs(next_weight + chain - gamma) < 1e-3:
             return found | {"targets/discount": torch.tensor(gamma), "targets/trace": torch.tensor(chain / gamma)}
-        times = of_next / (gamma * (1 - lam)) if lam < 1 else 1.0
+        times = next_weight / (gamma * (1 - lam)) if lam < 1 else 1.0
         return found | ({"targets/rescaled": torch.tensor((1 - times) ** 2)} if right[1] else {})
     both = on[:-1] & on[1:]  # A = δ + γ λ of the row before
     before = r[1:-1], one[1:-1], v[1:-1], v[2:], v[:-2], g[:-2]
     weights, left = fitted(torch.stack([x[both] for x in before], 1), g[1:-1][both])
-    forward = left < OF_TARGETS / 10 and 0 < weights[-1] <= 1  # above 1 it is the other way round, solved for this row
+    forward = left < TARGET_ROUNDING / 10 and 0 < weights[-1] <= 1  # above 1 it is backward, solved for this row
     return found | ({"targets/forward": torch.ones(())} if forward else {})
 
 
-def of_cuts(
+def cut_signals(
     config: RunConfig, rows: Rollout, target: Tensor, old_value: Callable[[Tensor], Tensor]
 ) -> dict[str, Tensor]:
     """The share of γ V(s') that targets [T, N] lack where a time limit, or the end of the rows, cuts an episode.
@@ -316,7 +318,7 @@ def _columns_of(config: RunConfig, data: Any, rows: Rollout) -> list[Tensor]:
     return [x.to(wide_float(x.device)).reshape(-1, envs) for x in columns]
 
 
-def of_minibatch(data: Any, rows: Tensor, batch: Any) -> dict[str, Tensor]:
+def minibatch_signals(data: Any, rows: Tensor, batch: Any) -> dict[str, Tensor]:
     """The share of the rows of a gradient step, [M, …], that are not those of the data [B, …] that it was to take.
 
     Advantages are left out, which are standardized on the way, and images and rewards, which may be changed on purpose.
@@ -329,7 +331,7 @@ def of_minibatch(data: Any, rows: Tensor, batch: Any) -> dict[str, Tensor]:
     return {"gradient/other_rows": torch.stack(others).any(0).float().mean()}
 
 
-def of_old_policy(networks: Any, batch: Any) -> dict[str, Tensor]:
+def old_policy_signals(networks: Any, batch: Any) -> dict[str, Tensor]:
     """The mean of |log π − log π_old| in a minibatch [M, …] before the first gradient step, where both are one policy.
 
     Of REPPO it is the KL divergence, of which the policy's μ and log σ are stored.
