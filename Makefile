@@ -25,8 +25,9 @@ race: setup  ## train a drone to race through gates, race from unseen starts, dr
 	$(BIN)/lemniscate train shac --env DroneGates-v0 --run $(RACE)
 	$(BIN)/lemniscate train ppo --env DroneGates-v0 --preset gates-finish --warm-start $(RACE) --report
 
-test: setup  ## the whole suite but the long ones
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not long and not faults and not soak and not cluster"
+QUICKLY_COMPILED = --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true
+test: setup  ## the whole suite but the long ones; what JAX compiles runs once, so that optimizing it does not pay
+	XLA_FLAGS="$(QUICKLY_COMPILED)" $(BIN)/python -m pytest -n auto --dist worksteal -m "not long and not faults and not soak and not cluster"
 
 test-long: setup  ## the tests that train for minutes, and those beside one of the same kind
 	$(BIN)/python -m pytest -m long

@@ -160,7 +160,7 @@ def _update(module, config, env, state):
         ),
     ],
 )
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 def test_each_algorithm_keeps_to_its_device_and_to_the_numbers_of_the_cpu(case, device, tmp_path):
     with pretend():
         rows = train_twice(case, torch.device(device), tmp_path / "there")

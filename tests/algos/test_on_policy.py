@@ -82,7 +82,7 @@ def test_with_reset_rows_the_value_is_wrong(algo):
         for kind in environments.KINDS
     ],
 )
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 def test_learns_in_spaces_of_every_kind(algo, kind):
     size = {"num_envs": 16, "num_steps": 16, "initial_log_std": -1.0, "normalize_observations": False}
     size |= {"total_steps": 30 * 256} if algo is ppo else {}

@@ -910,6 +910,7 @@ def test_signals_are_drawn_beside_findings_and_not_among_the_diagnostics(tmp_pat
 def of_update_of(algorithm, tmp_path, **fields):
     """The signals of what the updates of a run learned from: their greatest and least values."""
     given = {"num_envs": 4, "num_steps": 16, "total_steps": 640, "hidden": (8,), "progress": False, **fields}
+    given |= {name: 2 for name in ("epochs", "critic_epochs") if hasattr(algos.find(algorithm).Config, name)}
     if algorithm != "a2c":
         given |= {"minibatch_size" if algorithm == "ppo" else "critic_minibatch_size": 16}
     lines = read_metrics(lem.train(algorithm, "CartPole-v1", run=tmp_path / algorithm, **given).path)
@@ -1021,11 +1022,10 @@ def looked_at(algorithm, tmp_path, env="CartPole-v1", **fields):
     """The signals of what gradients are made of, and of targets, in a short run: their values by name."""
     small = {"num_envs": 4, "num_steps": 16, "total_steps": 1280, "hidden": (8,)}
     if algorithm in ("sac", "td3", "ddpg"):
-        env, small = (
-            "InvertedPendulum-v5",
-            {"total_steps": 1000, "learning_starts": 100, "batch_size": 32, "log_every": 50},
-        )
+        env = "InvertedPendulum-v5"
+        small = {"total_steps": 400, "learning_starts": 100, "batch_size": 32, "log_every": 25}
         small |= {"hidden": (16,), "critic_hidden": (16,)}
+    small |= {name: 2 for name in ("epochs", "critic_epochs") if hasattr(algos.find(algorithm).Config, name)}
     small |= {"minibatch_size": 16} if algorithm in ("ppo", "reppo", "pqn") else {}
     small |= {"critic_minibatch_size": 16} if algorithm in ("trpo", "reinforce") else {}
     env = "Pendulum-v1" if algorithm == "reppo" else env
@@ -1049,10 +1049,11 @@ def looked_at(algorithm, tmp_path, env="CartPole-v1", **fields):
         ("pqn", {}),
         ("sac", {}),
         ("sac", {"value_range": 10.0}),
-        ("sac", {"compile": "on", "num_updates": 4, "policy_delay": 2}),
+        ("sac", {"num_updates": 4, "policy_delay": 2}),
         ("ppo", {"env": "MountainCar-v0", "backend": "gymnasium"}),
         ("td3", {}),
         ("ddpg", {"compile": "on"}),
+        pytest.param("sac", {"compile": "on", "num_updates": 4, "policy_delay": 2}, marks=pytest.mark.long),
     ],
 )
 def test_a_gradient_is_of_the_terms_of_its_loss(algorithm, fields, tmp_path):
