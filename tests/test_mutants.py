@@ -1495,7 +1495,7 @@ MUTANTS = [
         "envs/vec_env.py",
         "self.backend.step(mine.clone())",
         "self.backend.step(mine)",
-        "envs/test_returned.py::test_what_an_environment_does_to_its_arguments_reaches_no_rollout",
+        "envs/test_vec_env.py::test_a_backend_of_ones_own_may_write_over_what_it_was_given_and_what_it_returned",
     ),
     (
         "an observation is taken from the buffer that the next step overwrites",

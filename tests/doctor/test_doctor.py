@@ -17,6 +17,7 @@ from lemniscate.doctor import Attendance, Evidence, diagnose, rules
 from lemniscate.doctor.evidence import usual_ranges, with_ratios
 from lemniscate.doctor.rules import HINT, RULES, seeds_differ, settings_far_out
 from lemniscate.run.fields import field_help, read
+from lemniscate.run.metrics import read_metrics
 from lemniscate.system.files import write_json
 
 ROOT = Path(__file__).parents[2]
@@ -1103,8 +1104,10 @@ class Zeros(gym.ObservationWrapper):
 
 
 def test_what_is_certain_is_said_once_while_a_run_is_trained(tmp_path, capsys):
-    fields = tiny_fields("CartPole-v1", total_steps=32 * 20, wrappers=(f"{__name__}:Zeros",))
+    fields = tiny_fields("CartPole-v1", total_steps=32 * 40, wrappers=(f"{__name__}:Zeros",))
     lem.train("ppo", "CartPole-v1", run=tmp_path / "r", **fields)
+    looks = [line for line in read_metrics(tmp_path / "r") if "reward/mean" in line]
+    assert len(looks) > 4  # from the fourth on it speaks
     said = [line for line in capsys.readouterr().err.splitlines() if "The policy sees nothing" in line]
     assert len(said) == 1
     assert "Look at what step() returns" in said[0]

@@ -80,7 +80,7 @@ def test_the_vectors_of_several_shards_are_described_as_one_is():
 
 
 class Reusing(Backend):
-    """A simulator of one's own that fills the same tensors at each step; `spoil` changes its answers."""
+    """A simulator of one's own that writes over actions and returned tensors; `spoil` changes its answers."""
 
     spoil = staticmethod(lambda step: step)
 
@@ -99,6 +99,7 @@ class Reusing(Backend):
         return self.obs.zero_()
 
     def step(self, action):
+        action += 5
         self.obs += 1
         self.reward += 1
         self.ended[:] = self.obs[:, 0] % 4 == 0
@@ -108,10 +109,12 @@ class Reusing(Backend):
         pass
 
 
-def test_a_backend_of_ones_own_may_write_over_what_it_returned():
+def test_a_backend_of_ones_own_may_write_over_what_it_was_given_and_what_it_returned():
     env = registry.make("Count", 2, backend=f"{__name__}:Reusing")
     env.restart(0)
-    steps = [env.step(torch.zeros(2, dtype=torch.int64)) for _ in range(4)]
+    action = torch.zeros(2, dtype=torch.int64)
+    steps = [env.step(action) for _ in range(4)]
+    assert action.tolist() == [0, 0]
     assert [step.reward.tolist() for step in steps] == [[t, t] for t in (1, 2, 3, 4)]
     assert [step.obs[0].item() for step in steps] == [1, 2, 3, 4]
     assert steps[-1].terminated.all()
