@@ -345,12 +345,14 @@ def cured(name: str, env: str, seed: int, folder: Path) -> list[float]:
     algorithm, _, change, _ = FAULTS[name]
     total = change.get("total_steps", CURED_IN[algorithm][env])
     healthy = {"total_steps": total, **(QUICK if algorithm == "sac" else {})}
+    healthy |= {name: change[name] for name in ("desired_kl",) if name in change}  # which would adapt a fault away
     path = folder / f"{name}-{env}-{seed}".replace(" ", "_")
     fields = {**healthy, **change}
     with_fault = trained_return(path, algorithm, env, seed, fields)
     first = next((one.remedy for one in lem.diagnose(path) if one.sure != "hint"), "")
     fields = remedied(algorithm, env, fields, first)
-    without = trained_return(folder / f"{algorithm}-{env}-{seed}-{total}", algorithm, env, seed, healthy)
+    shared = "-".join(f"{value}" for value in healthy.values())
+    without = trained_return(folder / f"{algorithm}-{env}-{seed}-{shared}", algorithm, env, seed, healthy)
     if lem.config_for(algorithm, env, "default", **fields) == lem.config_for(algorithm, env, "default", **healthy):
         return [with_fault, without, without]  # the same run, to the bit
     with_remedy = trained_return(path.with_name(path.name + "-remedy"), algorithm, env, seed, fields)
