@@ -515,6 +515,17 @@ def test_noise_is_no_reward_however_long_an_episode_gets():
     assert names(**noise, reward__mean=[-5.0] * 8) == []  # a reward for a step that is rare
 
 
+def test_where_rewards_do_not_vary_there_is_nothing_to_explain():
+    """InvertedPendulum: 1 for each step, but 0 where it falls, which is in few of the looks."""
+    given = {
+        "reward__std": [0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.08, 0.1],
+        "reward__mean": [0.99] * 8,
+        "returns": [50.0] * 99,
+    }
+    assert names(**given, reward__explained=[0.8, 0.0, 0.0, 0.0, 0.0, 0.0, 0.7, 0.7]) == []
+    assert names(**given, reward__explained=[0.0] * 8) == ["reward-unexplained"]
+
+
 def test_a_temperature_rises_where_the_entropy_is_below_its_target():
     rises = {"temperature": list(np.linspace(1.0, 2.0, 8)), "losses__entropy": [-2.0] * 8}
     assert names("sac", **rises) == []

@@ -314,7 +314,9 @@ def reward_size_faults(e: Evidence) -> Seen:
 
 def reward_faults(e: Evidence) -> Seen:
     """Faults of what the rewards depend on."""
-    by_time, explained, before = e.late("reward/by_time"), e.values("reward/explained"), e.values("reward/before")
+    by_time, before = e.late("reward/by_time"), e.values("reward/before")
+    vary = [line for line in e.log if line.get("reward/std", 0) > 1e-6]  # elsewhere there is nothing to explain
+    explained = [line["reward/explained"] for line in vary if "reward/explained" in line]
     std, by_age = e.late("reward/std"), e.late("reward/by_age")
     varies = std > 0.5 * abs(e.late("reward/mean"))  # not a reward that differs in the step of a goal alone
     if by_time > 0.8 and e.early("reward/by_time") > 0.5 and not e.is_slow:  # not what the policy has made of it
