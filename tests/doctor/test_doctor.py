@@ -520,7 +520,7 @@ def test_where_rewards_do_not_vary_there_is_nothing_to_explain():
     given = {
         "reward__std": [0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.08, 0.1],
         "reward__mean": [0.99] * 8,
-        "returns": [50.0] * 99,
+        "returns": [50.0 + i % 7 for i in range(99)],
     }
     assert names(**given, reward__explained=[0.8, 0.0, 0.0, 0.0, 0.0, 0.0, 0.7, 0.7]) == []
     assert names(**given, reward__explained=[0.0] * 8) == ["reward-unexplained"]
