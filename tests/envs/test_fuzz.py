@@ -877,7 +877,7 @@ def fuzz(examples, **options):
     return answers
 
 
-LINE, TWO = spaces.Box(-1, 1, (2,)), spaces.Discrete(2)
+LINE, TWO, POINT = spaces.Box(-1, 1, (2,)), spaces.Discrete(2), spaces.Box(-1, 1, (), np.float16)
 HIGH = spaces.MultiDiscrete(np.array([2], np.int8), dtype=np.int8, start=np.array([126], np.int8))
 FOUND = {
     "actions of float16": Plan(LINE, spaces.Box(-1, 1, (2,), np.float16)),
@@ -888,6 +888,7 @@ FOUND = {
     "one flag for three environments": Plan(LINE, TWO, num_envs=3, way="DISABLED", wrong="truncated", spoiled=False),
     "the mask of a last step": Plan(LINE, spaces.Discrete(9), num_envs=2, way="SAME_STEP", lengths=(1,), mask="action_mask"),
     "a number of 400 digits in an info": Plan(LINE, TWO, info={"a": ("endless",)}),
+    "one number through a wrapper of Gymnasium": Plan(POINT, POINT, form="tensor", limit=1, wrong="arity", spoiled=lambda x: x[0], at=1),
     "a mask that is not in the space": Plan(spaces.Dict({"a": LINE}), TWO, wrong="mask beside", spoiled=lambda x: {**x, "action_mask": [1, 1]}),
     "arguments of several lines": Plan(spaces.Box(np.float32([[0], [1]]), np.float32([[2], [3]])), TWO, wrong="no seed"),
 }  # fmt: skip

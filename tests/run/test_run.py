@@ -96,7 +96,9 @@ def history(path: Path) -> list[dict]:
 
 
 def without_signals(path: Path) -> list[dict]:
-    return [{k: v for k, v in line.items() if not k.startswith((*SIGNALS, "episode/terminated"))} for line in history(path)]
+    return [
+        {k: v for k, v in line.items() if not k.startswith((*SIGNALS, "episode/terminated"))} for line in history(path)
+    ]
 
 
 @pytest.mark.parametrize(

@@ -63,8 +63,9 @@ class ReturnedValues:
         if isinstance(error, SystemExit):
             code = "" if error.code is None else shown(error.code)
             return self.wrong(method, f"called sys.exit({code}), which would end the whole program")
-        *_, last = traceback.walk_tb(error.__traceback__)
-        if "unpack" not in str(error) or not last[0].f_globals["__name__"].startswith("gymnasium."):
+        frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__) if frame.f_code.co_name != "__iter__"]
+        said_of_unpacking = any(words in str(error) for words in ("unpack", "iteration over a 0-d"))
+        if not said_of_unpacking or not frames[-1].f_globals["__name__"].startswith("gymnasium."):
             return error
         return UserError(f"{author(self._env, method)} must return {VALUES[method]}: {error}.")
 
