@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torch import Tensor, nn
 
 
@@ -68,7 +67,7 @@ class Environments:
     """N environments side by side. What ended is reset after its true final observation has been stored."""
 
     def __init__(self, env: str, num_envs: int, seed: int) -> None:
-        self.envs = SyncVectorEnv([lambda: gym.make(env)] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+        self.envs = gym.vector.SyncVectorEnv([lambda: gym.make(env)] * num_envs, autoreset_mode="Disabled")
         # The first episodes are cut at random steps, or all would reach the time limit together.
         self.cut_in = np.random.default_rng(seed).integers(1, gym.spec(env).max_episode_steps + 1, num_envs)
         self.running, self.returns = np.zeros(num_envs), []  # of the running episodes, and of those that ended
@@ -98,12 +97,13 @@ class Environments:
 def estimate(c: Config, networks: nn.ModuleDict, rollout: list[Tensor]) -> list[Tensor]:
     """The rows [B, …] of a rollout: obs, action, log π_old(a|s), advantage and value target."""
     obs, action, next_obs, reward, terminated, done = rollout
-    value, next_value = (networks["value"](x).squeeze(-1) for x in (obs, next_obs))
+    value = networks["value"](obs).squeeze(-1)
+    other = torch.cat([done[:-1], torch.ones_like(done[-1:])])  # elsewhere the next row begins with this next obs
+    next_value = value.roll(-1, 0).masked_scatter(other, networks["value"](next_obs[other]).squeeze(-1))
     delta = reward + c.gamma * next_value * ~terminated - value  # eq. 12; no value follows a termination
     advantage, trace = torch.empty_like(delta), torch.zeros_like(delta[0])
     for t in reversed(range(len(delta))):  # A_t = δ_t + γλ A_{t+1}, up to the end of the episode; eq. 11
-        trace = delta[t] + c.gamma * c.gae_lambda * (~done[t]).float() * trace
-        advantage[t] = trace
+        advantage[t] = trace = delta[t] + c.gamma * c.gae_lambda * (~done[t]).float() * trace
     log_prob = networks["policy"](obs).log_softmax(-1).gather(-1, action.unsqueeze(-1)).squeeze(-1)
     return [rows.flatten(0, 1) for rows in (obs, action, log_prob, advantage, advantage + value)]
 
