@@ -235,7 +235,7 @@ def test_a_polyak_that_replaces_the_items_of_a_list_moves_no_network():
 
 @pytest.mark.parametrize("solution", [two_passes, by_number])
 @pytest.mark.parametrize("name", ["ddpg", "td3", "sac"])
-@pytest.mark.one_in(2)
+@pytest.mark.one_in(4)
 def test_a_polyak_that_takes_lists_is_right_and_trains(solution, name, monkeypatch, tmp_path):
     assert course.check(solution, "polyak")
     settings = dict(num_envs=2, total_steps=64, learning_starts=16, batch_size=8, hidden=(8,), progress=False)

@@ -12,7 +12,7 @@ from lemniscate import course
 @pytest.mark.parametrize(
     "exercise", [name if name != "train" else pytest.param(name, marks=pytest.mark.long) for name in course.EXERCISES]
 )
-@pytest.mark.one_in(8)
+@pytest.mark.one_in(16)
 def test_right_solutions_pass_and_wrong_ones_do_not(exercise, monkeypatch):
     monkeypatch.setattr("lemniscate.course.exercise.LIMIT", 3.0)  # some of them never end
     results = checker.zoo(exercise)

@@ -1849,7 +1849,7 @@ def test_each_mutant_is_of_a_line_that_is_there_and_of_a_test_that_is():
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=[mutant[0].replace(" ", "-") for mutant in MUTANTS])
-@pytest.mark.one_in(6)
+@pytest.mark.one_in(8)
 def test_the_suite_kills(server, tmp_path, mutant):
     _, name, right, wrong, tests = mutant
     # Without the files that importlib of another process is writing, and renames.

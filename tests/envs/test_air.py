@@ -206,6 +206,7 @@ def test_observations_that_are_late_are_the_states_of_then():
 
 
 @pytest.mark.parametrize("delay", [0.0191, 0.0199, 0.0201, 0.0395])
+@pytest.mark.one_in(2)
 def test_a_delay_between_steps_of_the_simulation_is_rounded_to_one(delay):
     env = registry.make("DroneFigureEightTrajectory-v0", 2, kwargs={"observation_delay": delay})
     env.restart(0)

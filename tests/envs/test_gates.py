@@ -483,6 +483,7 @@ def test_the_critic_is_told_where_the_gates_are(racing):
     assert not racing(0, privileged=True).seen[:, -6:].any()
 
 
+@pytest.mark.long
 def test_the_air_of_a_vehicle_is_that_of_a_race():
     """Late actions, wind, wider starts and several dynamics at once; a wider start is about the track's."""
     kwargs = {

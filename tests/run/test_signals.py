@@ -1052,7 +1052,7 @@ def looked_at(algorithm, tmp_path, env="CartPole-v1", **fields):
         ("sac", {"num_updates": 4, "policy_delay": 2}),
         ("ppo", {"env": "MountainCar-v0", "backend": "gymnasium"}),
         ("td3", {}),
-        ("ddpg", {"compile": "on"}),
+        pytest.param("ddpg", {"compile": "on"}, marks=pytest.mark.long),
         pytest.param("sac", {"compile": "on", "num_updates": 4, "policy_delay": 2}, marks=pytest.mark.long),
     ],
 )
