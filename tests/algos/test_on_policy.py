@@ -6,6 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 import environments
 import lemniscate as lem
@@ -20,7 +21,7 @@ from helpers import (
     require_in_own_process,
     small,
 )
-from lemniscate.algos import a2c, ppo, reinforce, reppo, trpo  # noqa: F401  (a case names REPPO)
+from lemniscate.algos import a2c, ppo, reinforce, reppo, trpo
 from lemniscate.data.rollout import collect
 from lemniscate.errors import UserError
 from lemniscate.optim.adam import Adam
@@ -238,3 +239,17 @@ def compiled_equals_eager(algo, env, programs):
 @pytest.mark.long
 def test_traced_updates_equal_eager_ones(case, compiler):
     require_in_own_process(__name__, f"compiled_equals_eager({case})", compiler)
+
+
+@pytest.mark.parametrize("algo", [trpo, reppo], ids=["trpo", "reppo"])
+def test_the_bound_of_the_kl_may_fall(algo):
+    """An update in the middle of a run is that with the bound in the middle of the schedule."""
+    moved = []
+    for bound in (0.006, "0.01>0.002", 0.01):
+        config, state, rollout = one_rollout(algo, max_kl=bound, total_steps=10_000)
+        state.step = 5_000
+        algo.update(config, state, rollout)
+        moved.append(nn.utils.parameters_to_vector(state.networks.parameters()))
+    constant, falling, wider = moved
+    torch.testing.assert_close(falling, constant, rtol=1e-4, atol=1e-6)
+    assert (wider - constant).abs().max() > 1e-4

@@ -48,7 +48,7 @@ class Config(RecurrentConfig):
     """gradient clipping by global norm, usually 0.5 to 1; none: no clipping"""
     td_lambda: Fraction = 0.95
     """trace decay λ of the soft return, usually 0.9 to 0.99; 0 is one-step TD, 1 Monte Carlo"""
-    max_kl: Positive = 0.2
+    max_kl: Scheduled[Positive] = 0.2
     """ε, the KL from the policy that collected beyond which a row only brings it back; usually 0.1 to 0.5"""
     target_entropy: Finite | None = None
     """H̄ in nats, the entropy that the temperature aims at, over actions in [-1, 1]^A; none: −A"""
@@ -156,6 +156,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     rate = linear(config.learning_rate, config.final_learning_rate, state.step / config.total_steps)
     for optimizer in state.optimizers():
         optimizer.learning_rate = rate
+    config = state.apply_schedules(config) if config.schedules else config
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
     batch, rows, metrics = targets(config, state, rollout), rows_of(rollout, state.networks.piece_length), []

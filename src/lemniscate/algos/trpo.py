@@ -29,7 +29,7 @@ class Config(RecurrentConfig):
 
     num_steps: Count = 64
     """steps of each environment between updates, T; usually 64 to 1024"""
-    max_kl: Positive = 0.01
+    max_kl: Scheduled[Positive] = 0.01
     """δ, the largest mean KL from the old policy to the new one in an update; usually 0.005 to 0.03"""
     line_search: bool = True
     """backtracking line search; without it this is the natural policy gradient"""
@@ -145,6 +145,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     """One step of the policy on one rollout, some epochs of the value; returns the metrics."""
     rate = linear(config.critic_learning_rate, config.final_critic_learning_rate, state.step / config.total_steps)
     state.critic_optimizer.learning_rate = rate
+    config = state.apply_schedules(config) if config.schedules else config
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
     batch, rows = advantages(config, state.networks, rollout), rows_of(rollout, state.networks.piece_length)

@@ -67,7 +67,7 @@ def conjugate_gradient(
 
 
 def natural_step(
-    product: Product, gradient: Float[Tensor, " P"], max_kl: float, *, iterations: int = 10
+    product: Product, gradient: Float[Tensor, " P"], max_kl: float | Tensor, *, iterations: int = 10
 ) -> Float[Tensor, " P"]:
     """The step that lowers a loss most among those of one length in KL: arXiv:1502.05477, appendix C.
 
@@ -92,7 +92,7 @@ def backtrack(
     start: Float[Tensor, " P"],
     step: Float[Tensor, " P"],
     *,
-    max_kl: float,
+    max_kl: float | Tensor,
     shrink: float = 0.8,
     attempts: int = 10,
 ) -> tuple[Float[Tensor, " P"], float]:
