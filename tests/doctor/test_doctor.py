@@ -741,6 +741,13 @@ def test_rollouts_of_a_few_steps_are_named_however_many_environments_there_are()
     assert names(changed={"num_steps": 2, "num_envs": 512}) == ["setting-num-steps"]
 
 
+def test_rollouts_that_leave_few_updates_are_named_in_a_short_run_alone():
+    large = {"num_envs": 16, "num_steps": 1_024}
+    assert names(changed=large | {"total_steps": 100_000}) == ["setting-rollout-rows"]  # 6 updates
+    assert names(changed=large | {"total_steps": 1_000_000}) == []
+    assert names(changed={"total_steps": 10_000}) == []  # few updates of the recommended size
+
+
 def test_two_choices_that_do_the_same_are_named():
     assert names(action__alike=[0.001] * 8, action__effect=[0.5] * 8) == ["action-part"]
     assert names(action__alike=[0.001] + [0.05] * 7, action__effect=[0.5] * 8) == []
