@@ -342,7 +342,7 @@ def remedied(algorithm: str, env: str, fields: Mapping[str, Any], remedy: str) -
 
 
 def cured(name: str, env: str, seed: int, folder: Path) -> list[float]:
-    """Mean returns of the final policies: with the fault, when the doctor's remedies were applied, and without the fault.
+    """Mean returns of the final policies: with the fault, with the doctor's remedies, and without the fault.
 
     The remedy of the first finding is applied, the run is trained again, and so on, up to three times.
     """
