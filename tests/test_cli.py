@@ -424,12 +424,23 @@ def test_who_names_no_algorithm_gets_the_recommended_one_and_is_told_why(tmp_pat
     assert json.loads((run / "config.json").read_text())["algorithm"] == "ppo"
 
 
+@pytest.mark.parametrize(("words", "same"), [(["help"], ["--help"]), (["help", "plot"], ["plot", "--help"])])
+def test_help_is_a_word_too(words, same, capsys):
+    said = []
+    for arguments in (words, same):
+        assert main(arguments) == 0
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1] != ""
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["train", "--env-args", "{}"], "Which algorithm? lemniscate train ALGORITHM …"),
         (["trian"], "There is no command 'trian': did you mean train?"),
         (["evaluat"], "There is no command 'evaluat': did you mean evaluate?"),
+        (["sweep"], "There is no command 'sweep': there is train, tune, resume, evaluate, watch, "),
+        (["help", "evaluat"], "There is no command 'evaluat': did you mean evaluate?"),
         (["--verion"], "The following arguments are required: COMMAND"),
         (["train"], "Which algorithm? lemniscate train ALGORITHM …, with one of reinforce, a2c, trpo, ppo"),
         (["train", "pp", "--env", "CartPole-v1"], "There is no algorithm 'pp': did you mean ppo or reppo?"),

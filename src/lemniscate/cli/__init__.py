@@ -289,12 +289,14 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """The command and its options. Raises `UserError` with one sentence on what is not understood."""
-    words = _normalized(arguments) or ["--help"]
+    words = _normalized(arguments) or ["help"]
+    if words[0] == "help":
+        words = [*words[1:2], "--help"]
     command = EARLIER.get(words[0], words[0])
     if command.startswith("-"):
         return _parse_none(words)
     if command not in COMMANDS:
-        raise unknown_name("command", command, COMMANDS)
+        raise unknown_name("command", command, COMMANDS, otherwise=f"there is {', '.join(COMMANDS)}.")
     if command in ("train", "tune"):
         return _parse_algorithm(command, words[1:])
     parser = parser_of(command)
