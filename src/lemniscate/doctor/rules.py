@@ -1042,7 +1042,7 @@ def settings_far_out(e: Evidence) -> list[tuple[Rule, str]]:
         if times := known.get("times_recommended"):
             low, high = (e.recommended.get(field, 0) * each for each in times)
         if share := known.get("share_of_steps"):
-            high = min(high, max(e.recommended.get(field, 0), share * e.config["total_steps"]))
+            high = min(high, max(e.recommended.get(field, 0), share * e.config.get("total_steps", np.inf)))
         factor = e.beyond(field, low, high)
         means = known.get("small" if factor < 0 else "large")
         if abs(factor) < FAR - 1e-9 or not means:
