@@ -8,7 +8,7 @@
     .venv/bin/python benchmarks/doctor.py faults --half unseen-four           and again; and unseen-five, unseen-six
     .venv/bin/python benchmarks/doctor.py faults --half elsewhere --seeds 1   under other algorithms, elsewhere
     .venv/bin/python benchmarks/doctor.py healthy
-    .venv/bin/python benchmarks/doctor.py remedies --seeds 1
+    .venv/bin/python benchmarks/doctor.py remedies --seeds 1 2 3
     .venv/bin/python benchmarks/doctor.py cost
     .venv/bin/python benchmarks/doctor.py table
     … --runs DIR           keep the runs there; one that is there is not trained again, only diagnosed

@@ -69,8 +69,6 @@ class Rule:
 
 
 def _may_help(clause: str, config: Mapping[str, object]) -> bool:
-    if "--network gru" in clause and "sequence_length" not in config:  # it learns with no memory
-        return False
     options = [
         (field_of(option), value) for option, value in re.findall(r"(--[a-z-]+)(?: (off|none|0)(?![\w.]))?", clause)
     ]
